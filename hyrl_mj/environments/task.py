@@ -88,7 +88,7 @@ class EnvironmentTask(Task):
         self._set_scene(specification.tracked)
 
     def __reduce__(self) -> tuple[Callable[..., Task], tuple[Any, ...]]:
-        return _again, (self.spec, self.noisy)
+        return _again, (self.spec, self.noisy, self.sensor, self.sensor_shares)
 
     def with_noise(self, shares: Sequence[float]) -> Self:
         task = super().with_noise(shares)
@@ -301,6 +301,10 @@ class EnvironmentTask(Task):
         return np.where(np.abs(turned) < DECIDED, ANY, (turned > 0).astype(int))
 
 
-def _again(spec: str, noisy: tuple[float, ...]) -> Task:
-    """Returns the task that a text describes, with shares of the noise (p,), in this or another process."""
-    return get_task(spec).with_noise(noisy)
+def _again(
+    spec: str, noisy: tuple[float, ...], sensor: str, sensor_shares: tuple[float, ...]
+) -> Task:
+    """Returns the task that a text describes, with its noise, in this or another process."""
+    task = get_task(spec).with_sensor(sensor, noisy)
+    task.sensor_shares = sensor_shares
+    return task

@@ -26,7 +26,7 @@ from hyrl_mj.ranges import (
     check_fields,
 )
 from hyrl_mj.sets import Grid, covering
-from hyrl_mj.simulation import AttackSettings
+from hyrl_mj.simulation import AttackSettings, Sensor
 from hyrl_mj.tasks import SEARCHES, Task
 
 PRESETS = ("fast", "paper", "smoke")
@@ -134,6 +134,9 @@ class Settings:
         resolution: length of the last rods, as a share of the first.
         search: search method for critical points, "rods" or "outcome".
         everywhere: whether the noise acts on all coordinates, not only on the task's noisy ones.
+        sensor: what the sensors do that the noise covers; None if they add noise of its bound alone.
+        shares: (p,) of the noise on the columns of the measurement, where a sensor needs others than the
+            task's.
         ways: how ways are told apart (stages 2 and 3).
         overlap: how far the parts are extended (stages 4 and 5).
         modes: where the policies of modes are trained, and when they are good enough (stage 6).
@@ -155,6 +158,8 @@ class Settings:
     resolution: Annotated[float, Number(1e-6, 1)] = 1 / 32
     search: Annotated[str, OneOf(SEARCHES)] = "rods"
     everywhere: Annotated[bool, Flag()] = False
+    sensor: Annotated[str | None, Optional(Text())] = None
+    shares: Annotated[tuple[float, ...], Several(Number(0, 1e6), 0, 1_000)] = ()
     ways: Annotated[WaySettings, Instance((WaySettings,))] = WaySettings()
     overlap: Annotated[OverlapSettings, Instance((OverlapSettings,))] = OverlapSettings()
     modes: Annotated[ModeSettings, Instance((ModeSettings,))] = ModeSettings()
@@ -171,6 +176,22 @@ class Settings:
             )
         if self.stage6.algorithm not in ALGORITHMS:
             raise unknown("stage6.algorithm", self.stage6.algorithm, ALGORITHMS)
+
+    def noisy(self, task: Task) -> Task:
+        """Returns a task with the noise of these settings.
+
+        Raises:
+            BadInput: its measurement has another number of columns than the settings are for.
+        """
+        if self.sensor is not None:
+            if len(self.shares) != len(task.noisy):
+                raise BadInput(
+                    f"shares {self.shares} cannot be used: give {len(task.noisy)}, one for each column of "
+                    f"the measurement of {task.name}"
+                )
+            Sensor.parse(self.sensor)
+            return task.with_sensor(self.sensor, self.shares)
+        return task.noisy_everywhere() if self.everywhere else task
 
     def check(self, task: Task) -> None:
         """Raises `BadInput` if a value does not fit the task: its chart, its episodes, or its inputs."""

@@ -21,10 +21,13 @@ from hyrl_mj.pipeline.steps import DIAGNOSIS, STAGES, extended_sets_stage, run_s
 from hyrl_mj.policies import ALGORITHMS, FUNCTION, AnyPolicy, algorithms, read_agent
 from hyrl_mj.runs.directory import Run, load_run, opened, write_config
 from hyrl_mj.sets import coarseness
-from hyrl_mj.simulation import judge_task
+from hyrl_mj.simulation import Sensor, judge_task
 from hyrl_mj.system.progress import Say
 from hyrl_mj.tasks import Task, check_as_made, check_task, get_task
 from hyrl_mj.viz import beginning
+
+# The paper's bound of the noise.
+BOUND = 0.1
 
 
 @dataclass(frozen=True)
@@ -32,7 +35,9 @@ class RunOptions:
     """The options of a run that trains its own policy.
 
     Attributes:
-        eps: bound of the measurement noise to survive, in the units of the chart.
+        eps: bound of the measurement noise to survive, in the units of the chart; by default 0.1.
+        noise: in place of a bound what the sensors do, as "uniform 0.05 + bias 0.05 + delay 1"; by default
+            what the task declares, if anything.
         seed: seed of all random numbers.
         preset: fast, paper (the paper's training, ten minutes), or smoke (seconds).
         algorithm: the algorithm of stage 1: ppo, a2c, dqn, sac, td3, ddpg, or module:Class for another one
@@ -44,7 +49,8 @@ class RunOptions:
         out: the run directory; by default runs/TASK.
     """
 
-    eps: float = 0.1
+    eps: float | None = None
+    noise: str | None = None
     seed: int = 0
     preset: str = "fast"
     algorithm: str | None = None
@@ -67,7 +73,9 @@ class AgentOptions:
             var, clip and epsilon; or none if it saw plain observations; by default what the agent tells.
         n_stack: the number of observations that the agent sees at once, for one trained under VecFrameStack;
             noisy episodes then replace the worst-case game.
-        eps: bound of the measurement noise to survive, in the units of the chart.
+        eps: bound of the measurement noise to survive, in the units of the chart; by default 0.1.
+        noise: in place of a bound what the sensors do, as for `hyrl-mj run`; by default what the task
+            declares, if anything.
         seed: seed of all random numbers.
         preset: fast, paper or smoke, as for `hyrl-mj run`.
         horizon: time T of the backward propagation [s]; by default the paper's with preset paper, otherwise
@@ -81,7 +89,8 @@ class AgentOptions:
     stochastic: bool = False
     vecnormalize: str | Path | None = None
     n_stack: int = 1
-    eps: float = 0.1
+    eps: float | None = None
+    noise: str | None = None
     seed: int = 0
     preset: str = "fast"
     horizon: float | None = None
@@ -236,8 +245,21 @@ def settings_of(task: Task, options: RunOptions) -> Settings:
 def _settings(task: Task, options: RunOptions | AgentOptions, **changes: Any) -> Settings:
     """Returns the settings of the preset that options name."""
     eps, seed, horizon = options.eps, options.seed, options.horizon
+    sensor = options.noise
+    shares: tuple[float, ...] = ()
+    if sensor is None and eps is None:
+        sensor = task.sensor or None
+    if sensor is not None:
+        if eps is not None or options.all_coordinates:
+            raise BadInput(
+                f"the noise {sensor!r} tells its bounds and where they act: leave eps and all_coordinates out"
+            )
+        eps, shares = (parsed := Sensor.parse(sensor)).on(task)
+        sensor, task = str(parsed), task.with_sensor(str(parsed), shares)
+    eps = BOUND if eps is None else eps
     settings = preset(task, options.preset, noise=eps, seed=seed, horizon=horizon, **changes)
-    settings = replace(settings, everywhere=options.all_coordinates)
+    everywhere = options.all_coordinates
+    settings = replace(settings, everywhere=everywhere, sensor=sensor, shares=shares)
     if options.set:
         settings = changed(settings, options.set)
     settings.check(task)

@@ -19,7 +19,15 @@ from hyrl_mj.judging.game import (
 )
 from hyrl_mj.policies import Controller, Policy
 from hyrl_mj.runs.directory import Run
-from hyrl_mj.simulation import AnyNoise, HybridArc, Noise, noise_kinds, samples, simulate_batch
+from hyrl_mj.simulation import (
+    AnyNoise,
+    HybridArc,
+    Noise,
+    Sensor,
+    noise_kinds,
+    samples,
+    simulate_batch,
+)
 from hyrl_mj.tasks import Task
 
 
@@ -63,8 +71,12 @@ def noisy_arcs(
         BadInput: a value that cannot be used, or a worst case that cannot be played.
     """
     task = run.task  # first: the file of a user's task may register noise
-    if noise not in (kinds := (*noise_kinds(), "worst", "attack")):
-        raise unknown("noise", noise, kinds)
+    kinds = (*noise_kinds(), "worst", "attack")
+    sensor = Sensor.parse(noise) if " " in noise.strip() else None
+    if sensor is None and noise not in kinds:
+        raise unknown("noise", noise, [*kinds, "a sum of parts as 'uniform 0.05 + delay 1'"])
+    if sensor is not None and eps is not None:
+        raise BadInput(f"the noise {noise!r} tells its own bounds: leave eps out")
     bound = task.check_noise(run.settings.noise if eps is None else eps)
     steps = None if horizon is None else samples(task, horizon)
     game = None
@@ -79,7 +91,9 @@ def noisy_arcs(
     for name, loop in run.loops.items():
         for q0 in q0s if name == "hyrl" else (None,):
             signal: AnyNoise
-            if noise == "attack":
+            if sensor is not None:
+                signal = sensor
+            elif noise == "attack":
                 begun = loop if q0 is None else _Begun(loop, q0)
                 found = attack(
                     task, {name: begun}, z0, bound, Budget(rounds=4), settings=run.settings.attack

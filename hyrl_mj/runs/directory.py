@@ -68,14 +68,14 @@ class Run:
 
     @cached_property
     def task(self) -> Task:
-        """The task, noisy on all coordinates if the run is made for that.
+        """The task, with the noise that the run is made for.
 
         Raises:
             BadInput: the settings do not fit it.
         """
-        task = described_task(self.settings.task)
+        task = self.settings.noisy(described_task(self.settings.task))
         self.settings.check(task)
-        return task.noisy_everywhere() if self.settings.everywhere else task
+        return task
 
     @cached_property
     def manifest(self) -> Manifest:

@@ -15,6 +15,7 @@ from hyrl_mj.simulation.lookahead import Ahead, Lookahead
 from hyrl_mj.simulation.noise import (
     KINDS,
     NOT_STARTED,
+    SENSOR,
     AnyNoise,
     Noise,
     Recorded,
@@ -30,6 +31,7 @@ from hyrl_mj.simulation.programmes import GIVEN, Programmes
 from hyrl_mj.simulation.real import judge, judge_task
 from hyrl_mj.simulation.rollout import LoopSettings, Rollout, closed_loop
 from hyrl_mj.simulation.rules import Rule, Rules
+from hyrl_mj.simulation.sensors import Sensor, covers_sensor
 from hyrl_mj.simulation.way_runs import WayRuns, policy_runs, way_runs
 
 __all__ = [
@@ -37,6 +39,7 @@ __all__ = [
     "KINDS",
     "LONGEST",
     "NOT_STARTED",
+    "SENSOR",
     "Ahead",
     "AnyNoise",
     "AttackSettings",
@@ -51,9 +54,11 @@ __all__ = [
     "Rule",
     "Rules",
     "Sample",
+    "Sensor",
     "Signal",
     "WayRuns",
     "closed_loop",
+    "covers_sensor",
     "drawn",
     "judge",
     "judge_task",

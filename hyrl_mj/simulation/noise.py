@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from copy import copy
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, Self, TypeVar, get_args
+from typing import TYPE_CHECKING, Literal, Protocol, Self, TypeVar, get_args, runtime_checkable
 
 import numpy as np
 
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 NOT_STARTED = -1
 # The kinds of noise by which controllers are judged, the mildest first.
 KINDS = ("none", "uniform", "alternating", "adversarial")
+# The kind that is what a task's own sensor does; see `hyrl_mj.simulation.sensors`.
+SENSOR = "sensor"
 # What follows the last sample of a recorded signal.
 After = Literal["refuse", "hold", "repeat", "none"]
 
@@ -124,6 +126,13 @@ def register_noise(signal: type[AnySignal]) -> type[AnySignal]:
     return signal
 
 
+def noise_class(kind: str) -> type[Signal]:
+    """Returns the class of a kind of noise; raises `BadInput` for a kind that is not registered."""
+    if kind not in _KINDS:
+        raise unknown("noise", kind, _KINDS)
+    return _KINDS[kind]
+
+
 def noise_kinds() -> tuple[str, ...]:
     """Returns the registered kinds of noise."""
     return tuple(_KINDS)
@@ -134,7 +143,8 @@ def usual_kinds(task: Task) -> tuple[str, ...]:
 
     Where samples take long, an adversary that looks ahead takes too long; an attack is there.
     """
-    return KINDS if task.effort.looks_ahead else KINDS[:-1]
+    kinds = KINDS if task.effort.looks_ahead else KINDS[:-1]
+    return (*kinds, SENSOR) if task.sensor else kinds
 
 
 @register_noise
@@ -256,8 +266,7 @@ class Noise:
     everywhere: bool = False
 
     def __post_init__(self) -> None:
-        if self.kind not in _KINDS:
-            raise unknown("noise", self.kind, _KINDS)
+        noise_class(self.kind)
         check_bound(self.bound)
 
     def against(self, task: Task, controller: Controller | None) -> Signal:
@@ -269,7 +278,8 @@ class Noise:
         task.check_noise(self.bound, self.everywhere)
         shares = np.ones(len(task.noisy)) if self.everywhere else np.array(task.noisy, dtype=float)
         signal = _KINDS[self.kind](self.bound, shares.copy()).against(task, controller)
-        if not np.array_equal(limits := limits_of(signal), self.bound * shares):
+        limits = limits_of(signal)
+        if self.kind != SENSOR and not np.array_equal(limits, self.bound * shares):
             raise BadInput(
                 f"{self.kind} noise of {self.bound:g} takes {limits} as its largest magnitudes, and "
                 f"is allowed {self.bound * shares}: leave its bound and shares as they are given"
@@ -277,8 +287,20 @@ class Noise:
         return signal
 
 
-# The types that a closed loop takes as noise.
-AnyNoise = Noise | Signal
+@runtime_checkable
+class AnyNoise(Protocol):
+    """What a closed loop takes as noise: a `Noise`, a `Sensor` or a `Signal`."""
+
+    @property
+    def kind(self) -> str:
+        """The name of its kind."""
+
+    @property
+    def bound(self) -> float:
+        """Its largest magnitude, in the unit of the measurement."""
+
+    def against(self, task: Task, controller: Controller | None) -> Signal:
+        """Returns the signal for one closed loop; see `Signal.against`."""
 
 
 def signal_for(noise: AnyNoise | None, task: Task, controller: Controller | None) -> Signal:
@@ -288,7 +310,7 @@ def signal_for(noise: AnyNoise | None, task: Task, controller: Controller | None
         BadInput: `noise` has another type, or cannot be used here.
     """
     noise = Noise() if noise is None else noise
-    if not isinstance(noise, AnyNoise):
+    if isinstance(noise, type) or not isinstance(noise, AnyNoise | Signal):
         raise BadInput(
             f'noise {noise!r:.80} cannot be used: give a hyrl_mj.Noise("uniform", 0.1), say'
         )

@@ -45,6 +45,10 @@ class Task(Problem):
     mirror: Mirror | None = None
     #: what replays and figures show
     scene: Scene
+    #: what its sensors do, as "uniform 0.05 + delay 1"; "" if they add noise of the bound alone
+    sensor: str = ""
+    #: shares (p,) of that noise on the columns of the measurement, where they are not those of `noisy`
+    sensor_shares: tuple[float, ...] = ()
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -91,7 +95,16 @@ class Task(Problem):
     def with_noise(self, shares: Sequence[float]) -> Self:
         """Returns this task with other shares (p,) of the noise bound on the columns of the measurement."""
         task = copy(self)
-        task.noisy = tuple(shares)
+        task.noisy, task.sensor_shares = tuple(shares), self.sensor_shares or tuple(self.noisy)
+        return task
+
+    def with_sensor(self, sensor: str, shares: Sequence[float]) -> Self:
+        """Returns this task with a sensor and shares (p,) of the noise bound that cover all that it does.
+
+        The sensor's own noise keeps the shares that the noise has had so far; see `hyrl_mj.Sensor`.
+        """
+        task = self.with_noise(shares)
+        task.sensor = sensor
         return task
 
     def noise_on(self, everywhere: bool = False) -> tuple[str, str]:

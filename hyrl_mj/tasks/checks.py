@@ -42,7 +42,7 @@ COMPUTED = (
     "dt", "measurement_columns", "has_inner_loop", "gives_direction", "kinematic", "chart_is_state",
     "obstacles", "plant", "placed", "tabulating", "verify", "draw_inputs", "check_measurement", "check_noise",
     "at", "perturbed", "outcome", "failed", "goes_on", "noise_in_chart", "noise_on", "noisy_everywhere",
-    "with_noise", "code", "spec",
+    "with_noise", "with_sensor", "sensor_shares", "moves", "code", "spec",
 )  # fmt: skip
 
 

@@ -11,6 +11,7 @@ from hyrl_mj.sets import Chart
 from hyrl_mj.tasks.anew import begins_anew
 from hyrl_mj.tasks.description import Outcome
 from hyrl_mj.tasks.effort import Effort
+from hyrl_mj.tasks.moves import largest_moves
 from hyrl_mj.tasks.robot import Robot
 
 
@@ -69,6 +70,11 @@ class Problem(Robot):
         d = self.chart.dimension
         same = self.measurement_columns == d and self.model.nq == d
         return same and self.kinematic and begins_anew(self, of_chart=True)
+
+    @cached_property
+    def moves(self) -> np.ndarray:
+        """The largest change (p,) of each column of the measurement in one sample, as runs show it."""
+        return largest_moves(self)
 
     @cached_property
     def set_point(self) -> np.ndarray | None:

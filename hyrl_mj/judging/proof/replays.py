@@ -19,13 +19,29 @@ from hyrl_mj.judging.proof.certificate import Certificate
 from hyrl_mj.judging.proof.counterexamples import CellNoise
 from hyrl_mj.policies import Controller
 from hyrl_mj.sets import Grid
-from hyrl_mj.simulation import NOT_STARTED, AnyNoise, LoopSettings, Noise, closed_loop, judge
+from hyrl_mj.simulation import (
+    NOT_STARTED,
+    SENSOR,
+    AnyNoise,
+    LoopSettings,
+    Noise,
+    closed_loop,
+    covers_sensor,
+    judge,
+)
 from hyrl_mj.tasks import Outcome, Task
 
 # Starts by kind of noise, 10,000 in all: a run of a minute takes about two seconds longer. The noise between
 # the nodes asks the controller about seventeen measurements at each sample, and the worst on nodes is looked
 # up, which takes twice as long as other noise: these get fewer starts.
-STARTS = {"none": 3_000, "uniform": 3_000, "alternating": 2_900, "worst": 1_000, "cells": 100}
+STARTS = {
+    "none": 3_000,
+    "uniform": 3_000,
+    "alternating": 2_900,
+    "worst": 1_000,
+    "cells": 100,
+    "sensor": 1_000,
+}
 # Runs side by side.
 BATCH = 1_000
 # Runs of each kind of noise that are played to their end, though they are proved to have arrived before.
@@ -166,6 +182,8 @@ def _noises(
     game = certificate.game
     simple = {kind: Noise(kind, eps, game.everywhere) for kind in ("uniform", "alternating")}
     noises: dict[str, AnyNoise] = {"none": Noise(), **simple, "worst": game.worst_noise(name, eps)}
+    if covers_sensor(game.task, eps):
+        noises[SENSOR] = Noise(SENSOR)
     if name in certificate.answers:
         outer, inner = certificate.value(name, eps), game.value(name, eps)
         noises["cells"] = CellNoise(certificate, controller, outer, inner, game.bound(eps))

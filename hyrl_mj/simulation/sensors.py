@@ -1,0 +1,375 @@
+"""Sensors: noise that is a sum of parts, some of which remember.
+
+A sensor measures with a bias, a drift and noise, rounds to a quantum, and sends what arrives late or not at
+all. `Sensor.parse` reads such a sum from a text; `Sensor.reach` bounds what all of it together can hide, so
+that what holds for every noise within that bound holds for the sensor.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from copy import copy
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, ClassVar, Self
+
+import numpy as np
+from scipy.special import ndtr, ndtri
+
+from hyrl_mj.errors import BadInput, check_bound, unknown
+from hyrl_mj.simulation.noise import (
+    SENSOR,
+    Sample,
+    Signal,
+    noise_class,
+    noise_kinds,
+    register_noise,
+)
+
+if TYPE_CHECKING:
+    from hyrl_mj.policies import Controller
+    from hyrl_mj.tasks import Task
+
+# The words of parts that are not noise which is added to a sample.
+DELAY, HOLD, QUANTUM = "delay", "hold", "quantum"
+# Bounds are rounded to so many decimals, and sums of floats may exceed them by as much.
+DECIMALS = 9
+
+
+@register_noise
+class Gaussian(Signal):
+    """Normal noise drawn anew at every sample, truncated at its bound.
+
+    Attributes:
+        sigma: standard deviation before it is truncated, by default a third of the bound.
+    """
+
+    kind = "gaussian"
+    unseeing = True
+    sigma: float | None = None
+
+    def sample(self, now: Sample) -> np.ndarray:
+        sigma = self.bound / 3 if self.sigma is None else self.sigma
+        if not self.bound:
+            return np.zeros_like(now.measurement)
+        share = self.rng.uniform(
+            ndtr(-self.bound / sigma), ndtr(self.bound / sigma), now.measurement.shape
+        )
+        return np.clip(sigma * ndtri(share), -self.bound, self.bound) * self.shares
+
+
+@register_noise
+class Bias(Signal):
+    """An error that is drawn at the start of an episode, uniformly between its bounds, and stays."""
+
+    kind = "bias"
+    unseeing = True
+
+    def reset(self, n: int, rng: np.random.Generator) -> None:
+        super().reset(n, rng)
+        self._bias = np.zeros((n, len(self.shares)))
+
+    def sample(self, now: Sample) -> np.ndarray:
+        begun = now.rows[now.k == 0]
+        if len(begun):
+            drawn = self.rng.uniform(-self.bound, self.bound, (len(begun), len(self.shares)))
+            self._bias[begun] = drawn
+        return self._bias[now.rows] * self.shares
+
+
+@register_noise
+class Drift(Signal):
+    """An error that goes from one value between its bounds to the next, drawn uniformly, at its rate.
+
+    Attributes:
+        rate: how fast it changes, in the unit of the measurement each second; by default by the bound.
+    """
+
+    kind = "drift"
+    unseeing = True
+    rate: float | None = None
+    _step: float
+
+    def against(self, task: Task, controller: Controller | None) -> Self:
+        signal = super().against(task, controller)
+        signal._step = task.dt * (self.bound if self.rate is None else self.rate)
+        return signal
+
+    def reset(self, n: int, rng: np.random.Generator) -> None:
+        super().reset(n, rng)
+        self._drift, self._goal = (np.zeros((n, len(self.shares))) for _ in range(2))
+
+    def sample(self, now: Sample) -> np.ndarray:
+        rows, fresh = now.rows, (now.k == 0)[:, None]
+        first, turn = self.rng.uniform(-self.bound, self.bound, (2, len(rows), len(self.shares)))
+        at, goal = self._drift[rows], self._goal[rows]
+        there = np.abs(goal - at) <= self._step
+        at = np.where(fresh, first, np.where(there, goal, at + self._step * np.sign(goal - at)))
+        goal = np.where(fresh | there, -np.sign(at) * np.abs(turn), goal)  # to the other side
+        self._drift[rows], self._goal[rows] = at, goal
+        return at * self.shares
+
+
+@dataclass(frozen=True)
+class Part:
+    """One part of a sensor.
+
+    Attributes:
+        word: a kind of noise, or "delay", "hold" or "quantum".
+        value: the bound of noise and the quantum, in the unit of the measurement; the longest delay, or the
+            most samples that are held in a row.
+        options: other numbers by their names: `sigma`, `rate`, or the shortest delay as `least`.
+    """
+
+    word: str
+    value: float
+    options: Mapping[str, float] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        value, options = f"{self.value:.12g}", dict(self.options)
+        if self.word == DELAY and (least := options.pop("least", self.value)) < self.value:
+            value = f"{least:.12g}-{value}"
+        return " ".join([self.word, value, *(f"{name} {x:.12g}" for name, x in options.items())])
+
+    @property
+    def is_noise(self) -> bool:
+        """Whether it is noise that is added to each sample."""
+        return self.word not in (DELAY, HOLD, QUANTUM)
+
+    @staticmethod
+    def parse(text: str) -> Part:
+        """Returns the part that a text names, as "drift 0.05 rate 0.01".
+
+        Raises:
+            BadInput: it names none, or a number that cannot be.
+        """
+        word, *rest = text.split() or [""]
+        words = [kind for kind in noise_kinds() if kind not in ("none", SENSOR)]
+        if word not in (words := [*words, DELAY, HOLD, QUANTUM]):
+            raise unknown("part of a sensor", word, words)
+        allowed = ["rate"] if word == HOLD else []
+        if word in noise_kinds():
+            allowed = [name for name in ("sigma", "rate") if hasattr(noise_class(word), name)]
+        said = f"{text.strip()!r} is no part of a sensor"
+        what = " ".join([word, "N", *(f"[{name} X]" for name in allowed)])
+        names, values = rest[1::2], rest[2::2]
+        if not rest or len(names) != len(values) or len({*names}) < len(names):
+            raise BadInput(f"{said}: write {what}, as in 'uniform 0.05 + bias 0.05 + delay 1'")
+        if wrong := [name for name in names if name not in allowed]:
+            raise BadInput(f"{said}, because {word} has no {wrong[0]}: write {what}")
+        first, options = rest[0], {}
+        if word == DELAY and (between := re.fullmatch(r"(\d+)-(\d+)", first)):
+            options["least"], first = float(between[1]), between[2]
+        try:
+            value = float(first)
+            options |= {name: float(x) for name, x in zip(names, values, strict=True)}
+        except ValueError:
+            raise BadInput(f"{said}: its numbers are no numbers, write {what}") from None
+        return Part(word, value, options)._checked()
+
+    def _checked(self) -> Part:
+        value, options = self.value, self.options
+        check_bound(value)
+        if self.word in (DELAY, HOLD) and not (1 <= value <= 1_000 and value == int(value)):
+            raise BadInput(f"{self}: give a whole number of samples from 1 to 1000")
+        if options.get("least", value) > value:
+            raise BadInput(f"{self}: give the shortest delay first")
+        if self.word == HOLD and not 0 < options.get("rate", 1) <= 1:
+            raise BadInput(f"{self}: the rate is the share of samples that are held, in (0, 1]")
+        for name, x in options.items():
+            if name in ("sigma", "rate") and not (math.isfinite(x) and x > 0):
+                raise BadInput(f"{self}: give a {name} > 0")
+        return self
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """Noise as a sensor makes it: the sum of its parts.
+
+    Each sample is what is true, plus noise of each kind, rounded to the quantum. It arrives after the delay;
+    one that is lost is replaced by the last that arrived. A robot was at rest before the start. Noise, bias
+    and drift act on the noisy columns of the measurement by their shares, as for `Noise`; a delayed or held
+    sample has all columns of its time.
+
+    Attributes:
+        parts: the parts.
+    """
+
+    parts: tuple[Part, ...]
+    kind: ClassVar[str] = SENSOR
+
+    @staticmethod
+    def parse(text: str) -> Sensor:
+        """Returns the sensor that a text describes, as "uniform 0.05 + bias 0.05 + delay 1".
+
+        Its parts are: KIND B for each kind of noise (uniform, gaussian B [sigma S], alternating, bias,
+        drift B [rate R], ...) with its bound B; delay D, or delay D-E for one that is drawn for each episode
+        [samples]; hold M [rate P], where samples are lost with probability P (by default a half), at most M
+        in a row; and quantum Q.
+
+        Raises:
+            BadInput: it describes none.
+        """
+        parts = tuple(Part.parse(part) for part in text.split("+"))
+        for word in (DELAY, HOLD, QUANTUM):
+            if sum(part.word == word for part in parts) > 1:
+                raise BadInput(f"{text!r} has more than one {word}: give one")
+        return Sensor(parts)
+
+    def __str__(self) -> str:
+        return " + ".join(map(str, self.parts))
+
+    @property
+    def bound(self) -> float:
+        """The largest magnitude of what is added to a sample, in the unit of the measurement."""
+        return sum(part.value for part in self.parts if part.is_noise) + self._of(QUANTUM) / 2
+
+    @property
+    def late(self) -> int:
+        """How many samples old a measurement can be."""
+        return int(self._of(DELAY) + self._of(HOLD))
+
+    def _of(self, word: str) -> float:
+        return next((part.value for part in self.parts if part.word == word), 0.0)
+
+    def reach(self, task: Task) -> np.ndarray:
+        """Returns how far off each column of a measurement can be: (p,), in its unit.
+
+        That is the bound of what is added, and what the robot moves meanwhile; see `Task.moves`.
+        """
+        added = self.bound * np.abs(self._shares(task))
+        return np.round(added + self.late * task.moves if self.late else added, DECIMALS)
+
+    def on(self, task: Task) -> tuple[float, tuple[float, ...]]:
+        """Returns the noise bound, and its shares (p,), that cover all that it can do to a chart point.
+
+        Columns of the measurement beside the chart get the noise that is added to them.
+
+        Raises:
+            BadInput: the sensor cannot be used with the task, or its noise hides the whole chart.
+        """
+        self.against(task, None)
+        reach, d = self.reach(task), task.chart.dimension
+        reach[d:] = self.bound * np.abs(self._shares(task))[d:]
+        if not (bound := float(reach[:d].max())):
+            raise BadInput(
+                f"the sensor {self} adds nothing on the chart of {task.name}: give it a bound"
+            )
+        shares = tuple((reach / bound).tolist())
+        return task.with_noise(shares).check_noise(bound), shares
+
+    def against(self, task: Task, controller: Controller | None) -> Signal:
+        """Returns the signal for one closed loop.
+
+        Raises:
+            BadInput: a part cannot be used there.
+        """
+        if self.late and task.abilities.side_by_side is not None:
+            raise BadInput(
+                f"{task.name} is an environment, which observes by itself: put Gymnasium's "
+                "DelayObservation around it for a delay, and leave delay and hold out of the sensor"
+            )
+        if self.late >= task.max_steps:
+            raise BadInput(
+                f"the sensor {self} can be {self.late} samples late, and an episode of {task.name} has "
+                f"{task.max_steps}: give fewer"
+            )
+        signal = Sensed(self.bound, self._shares(task))
+        signal.begin(self, task, controller)
+        return signal
+
+    def _shares(self, task: Task) -> np.ndarray:
+        return np.array(task.sensor_shares or task.noisy, dtype=float)
+
+
+@register_noise
+class Sensed(Signal):
+    """The noise of a sensor in one closed loop.
+
+    `Noise("sensor", eps)` is what the task's own sensor does, with the bound that covers it, or with none.
+    """
+
+    kind = SENSOR
+
+    def against(self, task: Task, controller: Controller | None) -> Self:
+        if not task.sensor:
+            raise BadInput(
+                f"{task.name} has no sensor of its own: make its run with --noise, as --noise 'uniform 0.05 "
+                "+ delay 1', or give another kind of noise"
+            )
+        if self.bound and not covers_sensor(task, self.bound):
+            raise BadInput(
+                f"the sensor of {task.name} ({task.sensor}) reaches beyond a bound of {self.bound:g}: leave "
+                "the bound out"
+            )
+        signal = copy(self)
+        signal.begin(Sensor.parse(task.sensor), task, controller)
+        return signal
+
+    def begin(self, sensor: Sensor, task: Task, controller: Controller | None) -> None:
+        """Gets ready for one closed loop."""
+        shares, self._reach = sensor._shares(task), sensor.reach(task)
+        self.bound, self.shares = float(self._reach.max()), shares
+        self.sensor, self.task = sensor, task
+        self.noises: list[Signal] = []
+        for part in sensor.parts:
+            if part.is_noise:
+                noise = noise_class(part.word)(part.value, shares.copy())
+                vars(noise).update(part.options)
+                self.noises.append(noise.against(task, controller))
+        self._quantum = sensor._of(QUANTUM) * np.abs(shares)
+        parts = {part.word: part for part in sensor.parts}
+        delay, hold = (parts.get(word, Part(word, 0.0)) for word in (DELAY, HOLD))
+        self._delays = int(delay.options.get("least", delay.value)), int(delay.value)
+        self._most, self._rate = int(hold.value), hold.options.get("rate", 0.5)
+        alone = not (sensor.late or self._quantum.any())
+        self.unseeing = alone and all(noise.unseeing for noise in self.noises)
+
+    @property
+    def limits(self) -> np.ndarray:
+        return np.asarray(self._reach + (self._reach > 0) * 10.0**-DECIMALS)
+
+    def reset(self, n: int, rng: np.random.Generator) -> None:
+        super().reset(n, rng)
+        for noise in self.noises:
+            noise.reset(n, rng)
+        columns = len(self.shares)
+        self._sent = np.zeros((n, 1 + self._delays[1], columns))  # the last one last
+        self._told, self._row, self._delay = (
+            np.zeros((n, columns)),
+            np.zeros(n, int),
+            np.zeros(n, int),
+        )
+
+    def sample(self, now: Sample) -> np.ndarray:
+        true, rows, fresh = now.measurement, now.rows, now.k == 0
+        seen = true + sum((noise.sample(now) for noise in self.noises), np.zeros_like(true))
+        if (some := self._quantum > 0).any():
+            seen[:, some] = np.round(seen[:, some] / self._quantum[some]) * self._quantum[some]
+        if not self.sensor.late:
+            return seen - true
+        sent = np.concatenate([self._sent[rows, 1:], seen[:, None]], axis=1)
+        sent[fresh] = seen[fresh, None]
+        self._sent[rows] = sent
+        low, high = self._delays
+        self._delay[rows[fresh]] = self.rng.integers(low, high + 1, int(fresh.sum()))
+        told = sent[np.arange(len(rows)), -1 - self._delay[rows]]
+        if self._most:
+            lost = (self.rng.random(len(rows)) < self._rate) & (self._row[rows] < self._most)
+            lost &= ~fresh
+            told[lost] = self._told[rows[lost]]
+            self._row[rows] = np.where(lost, self._row[rows] + 1, 0)
+        self._told[rows] = told
+        noise, d = told - true, self.task.chart.dimension
+        noise[:, :d] = self.task.chart.difference(told[:, :d], true[:, :d])
+        return noise
+
+
+def covers_sensor(task: Task, bound: float) -> bool:
+    """Returns whether a task has a sensor of its own, and noise up to a bound covers all that it does."""
+    if not task.sensor:
+        return False
+    d = task.chart.dimension
+    reach = Sensor.parse(task.sensor).reach(task)[:d]
+    return bool((reach <= task.noise_in_chart(bound) + 10.0**-DECIMALS).all())
