@@ -99,7 +99,7 @@ def coarsen(patch):
     few = {"size": (480, 160), "fps": 2}
     patch.setattr(steps, "SMOKE", replace(steps.SMOKE, **few))
     patch.setattr(diagnosis, "REPLAY", replace(diagnosis.REPLAY, **few))
-    starts = {"none": 60, "uniform": 60, "alternating": 60, "worst": 60, "cells": 10}
+    starts = {"none": 60, "uniform": 60, "alternating": 60, "worst": 60, "cells": 10, "sensor": 60}
     patch.setattr(replays, "STARTS", starts)
     patch.setattr(replays, "WHOLE", 10)
 

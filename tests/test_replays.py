@@ -23,7 +23,7 @@ from hyrl_mj.simulation import NOT_STARTED, LoopSettings, closed_loop, judge, ju
 from hyrl_mj.tasks import Outcome
 from hyrl_mj.tasks.vehicle import Vehicle
 
-FEW = {"none": 120, "uniform": 120, "alternating": 120, "worst": 60, "cells": 20}
+FEW = {"none": 120, "uniform": 120, "alternating": 120, "worst": 60, "cells": 20, "sensor": 60}
 
 
 @pytest.fixture(autouse=True)

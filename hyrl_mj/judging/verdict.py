@@ -17,7 +17,7 @@ from hyrl_mj.judging.sentences import (
     replays_sentence,
     share_sentence,
 )
-from hyrl_mj.simulation import usual_kinds
+from hyrl_mj.simulation import covers_sensor, usual_kinds
 from hyrl_mj.tasks import Task
 
 
@@ -139,8 +139,14 @@ class _Case:
     @property
     def noise(self) -> str:
         """The noise of the examination, in words."""
-        where, unit = self.task.noise_on(self.robustness.everywhere)
-        return f"noise of up to {self.robustness.eps:g} {unit} on {where}"
+        eps, everywhere = self.robustness.eps, self.robustness.everywhere
+        where, unit = self.task.noise_on(everywhere)
+        if not self.task.sensor:
+            return f"noise of up to {eps:g} {unit} on {where}"
+        bounds = self.task.noise_in_chart(eps, everywhere)  # of a sensor they differ
+        columns = zip(bounds, self.task.chart.units, self.task.chart.names, strict=True)
+        each = [f"{bound:g} {unit} on {name}" for bound, unit, name in columns if bound]
+        return f"noise of up to {listed(each)}"
 
     @property
     def whole(self) -> str:
@@ -347,6 +353,8 @@ class _Case:
 
     def reasons(self) -> Iterator[str]:
         """Yields the results behind the verdict."""
+        if covers_sensor(self.task, self.robustness.eps):
+            yield f"what the sensors do is within that bound: {self.task.sensor}"
         yield from self._shares() if self.robustness.deciding else self._counts()
         yield from map(comparison_sentence, self.robustness.comparisons)
         yield f"stage 1: the policy {self.arrivals}"

@@ -1,0 +1,246 @@
+"""Sensors: each part does what it says, together they stay within their bound, and runs are made for them."""
+
+import shutil
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from environments import Puck
+from hypothesis import given, settings, strategies as st
+from manual import ROOT
+from planted import TINY
+
+import hyrl_mj
+from hyrl_mj import BadInput, Noise, RunOptions, Sensor, cli
+from hyrl_mj.pipeline import ExamineOptions, examine_run
+from hyrl_mj.pipeline.runs import settings_of
+from hyrl_mj.simulation import KINDS, SENSOR, LoopSettings, closed_loop, covers_sensor
+from hyrl_mj.viz import beginning
+
+VEHICLE, CIRCLE = "vehicle", "unit_circle"
+
+
+@dataclass(frozen=True)
+class Fixed:
+    """Steers by the measurement alone."""
+
+    def act(self, measured):
+        return np.clip(-measured[:, -1:], -1, 1)
+
+
+def played(text, n=50, task=VEHICLE, seed=0, steps=40):
+    """What was added (K, n, p), and the rollout."""
+    task = hyrl_mj.get_task(task)
+    z0 = task.starts(n, np.random.default_rng(3))
+    options = LoopSettings(record=True, quiet=True, steps=steps)
+    loop = hyrl_mj.policies.PolicyController(Fixed())
+    run = closed_loop(task, loop, z0, Sensor.parse(text), seed=seed, settings=options)
+    return run.measured - run.true[:-1], run
+
+
+def lateral(text, **options):
+    return played(text, **options)[0][:, :, 1]
+
+
+def test_noise_is_drawn_anew_within_its_bound():
+    for text, spread in (("uniform 0.3", 0.3 / 3**0.5), ("gaussian 0.3 sigma 0.1", 0.0987)):
+        noise = lateral(text)
+        assert np.abs(noise).max() <= 0.3
+        assert noise.std() == pytest.approx(spread, rel=0.05)
+        assert abs(np.corrcoef(noise[1:].ravel(), noise[:-1].ravel())[0, 1]) < 0.1
+    assert np.abs(lateral("gaussian 0.1 sigma 9")).std() == pytest.approx(0.1 / 12**0.5, rel=0.1)
+
+
+def test_a_bias_stays_and_differs_from_episode_to_episode():
+    noise = lateral("bias 0.3")
+    assert np.ptp(noise, axis=0).max() < 1e-12
+    assert noise[0].min() < -0.25
+    assert noise[0].max() > 0.25
+
+
+def test_a_drift_goes_at_its_rate():
+    task = hyrl_mj.get_task(VEHICLE)
+    noise, step = lateral("drift 0.2 rate 0.5"), 0.5 * task.dt
+    moved = np.abs(np.diff(noise, axis=0))
+    assert moved.max() == pytest.approx(step)
+    assert np.median(moved) == pytest.approx(step)
+    assert np.abs(noise).max() <= 0.2
+    assert (np.sign(noise[0]) != np.sign(noise[-1])).any()
+
+
+def test_a_delay_is_what_was_true_before():
+    run = played("delay 2", steps=20)[1]
+    true = run.true
+    for k, before in ((0, 0), (1, 0), (2, 0), (3, 1), (9, 7)):
+        np.testing.assert_allclose(run.measured[k], true[before], rtol=0, atol=1e-12)
+    drawn = played("delay 0-2", steps=20)[1]
+    late = [
+        {d for d in range(3) if np.allclose(drawn.measured[9, i], drawn.true[9 - d, i])}
+        for i in range(50)
+    ]
+    assert all(late)
+    assert {min(some) for some in late} == {0, 1, 2}
+
+
+def test_samples_are_held_at_most_so_often_in_a_row():
+    run = played("hold 3 rate 0.6", n=500, steps=13)[1]
+    on = np.arange(1, len(run.measured))[:, None] < run.length
+    x, longest, row = run.measured[:, :, 0], 0, np.zeros(500)
+    held = (x[1:] == x[:-1]) & on  # the vehicles drive on
+    for now in held:
+        row = np.where(now, row + 1, 0)
+        longest = max(longest, row.max())
+    assert longest == 3
+    # Of a chain that loses with probability p, but never more than three in a row.
+    p = 0.6
+    share = (p + p**2 + p**3) / (1 + p + p**2 + p**3)
+    assert held.sum() / on.sum() == pytest.approx(share, abs=0.03)
+
+
+def test_a_quantum_rounds_the_noisy_columns():
+    run = played("uniform 0.05 + quantum 0.02")[1]
+    y = run.measured[:, :, 1] / 0.02
+    np.testing.assert_allclose(y, np.round(y), atol=1e-9)
+    assert np.array_equal(run.measured[:, :, 0], run.true[:-1, :, 0])
+
+
+def test_a_turn_is_no_jump():
+    assert np.abs(played("delay 1", task=CIRCLE, steps=150)[0]).max() <= 0.05 + 1e-9
+
+
+parts = st.fixed_dictionaries(
+    {},
+    optional={
+        "uniform": st.floats(0.001, 0.1),
+        "bias": st.floats(0.001, 0.1),
+        "drift": st.floats(0.001, 0.1),
+        "gaussian": st.floats(0.001, 0.1),
+        "delay": st.integers(1, 4),
+        "hold": st.integers(1, 3),
+        "quantum": st.floats(0.001, 0.05),
+    },
+).filter(len)
+
+
+@settings(max_examples=25, deadline=None)
+@given(parts, st.sampled_from([VEHICLE, CIRCLE, "gate"]), st.integers(0, 1000))
+def test_all_parts_together_stay_within_the_bound(numbers, name, seed):
+    text = " + ".join(f"{word} {value:.6g}" for word, value in numbers.items())
+    sensor, task = Sensor.parse(text), hyrl_mj.get_task(name)
+    assert str(Sensor.parse(str(sensor))) == str(sensor)
+    noise, _ = played(text, task=name, seed=seed, n=20)
+    d = task.chart.dimension
+    bound, shares = sensor.on(task)
+    assert (np.nanmax(np.abs(noise), axis=(0, 1))[:d] <= bound * np.array(shares[:d]) + 1e-9).all()
+    again, _ = played(text, task=name, seed=seed, n=20)
+    np.testing.assert_array_equal(noise, again)
+
+
+BAD = {
+    "": "unknown part of a sensor ''",
+    "uniform": "write uniform N",
+    "uniform x": "its numbers are no numbers",
+    "uniform 0.1 rate 3": "uniform has no rate",
+    "drift 0.1 rate": r"write drift N \[rate X\]",
+    "drift 0.1 rate 0": "give a rate > 0",
+    "gaussian 0.1 sigma nan": "give a sigma > 0",
+    "delay 0": "a whole number of samples",
+    "delay 1.5": "a whole number of samples",
+    "delay 3-1": "give the shortest delay first",
+    "delay 1 + delay 2": "more than one delay",
+    "hold 3 rate 2": r"share of samples that are held, in \(0, 1\]",
+    "quantum -1": "finite number >= 0",
+    "bias inf": "finite number >= 0",
+    "unifrom 0.1": "Did you mean 'uniform'",
+    "sensor 0.1": "unknown part of a sensor",
+    "uniform 0.1 +": "unknown part of a sensor ''",
+}
+
+
+@pytest.mark.parametrize("text", BAD)
+def test_what_is_no_sensor_is_refused(text):
+    with pytest.raises(BadInput, match=BAD[text]):
+        Sensor.parse(text)
+
+
+def test_what_cannot_be_sensed_is_refused():
+    vehicle = hyrl_mj.get_task(VEHICLE)
+    with pytest.raises(BadInput, match="60: give fewer"):
+        Sensor.parse("delay 60").on(vehicle)
+    with pytest.raises(BadInput, match="hides the whole state space"):
+        Sensor.parse("uniform 1 + bias 1").on(vehicle)
+    with pytest.raises(BadInput, match="adds nothing"):
+        Sensor.parse("uniform 0").on(vehicle)
+    with pytest.raises(BadInput, match="has no sensor of its own"):
+        Noise("sensor", 0.1).against(vehicle, None)
+    task = hyrl_mj.from_gymnasium(Puck)
+    with pytest.raises(BadInput, match="put Gymnasium's DelayObservation around it"):
+        Sensor.parse("delay 1").against(task, None)
+    assert Sensor.parse("bias 0.1").on(task)[0] == 0.1
+
+
+# ---- runs
+
+
+@pytest.fixture(scope="module")
+def late(tmp_path_factory):
+    """A small run that is made for a sensor."""
+    out = tmp_path_factory.mktemp("late") / "run"
+    text = "uniform 0.05 + bias 0.05 + delay 1"
+    return hyrl_mj.run(
+        VEHICLE, noise=text, preset="smoke", set=TINY, out=out, say=lambda text: None
+    )
+
+
+@pytest.mark.slow
+def test_a_run_is_made_for_a_bound_that_covers_the_sensor(late, capsys):
+    run, s = hyrl_mj.load_run(late.path), late.settings
+    assert (s.noise, s.sensor) == (0.15, "uniform 0.05 + bias 0.05 + delay 1")
+    np.testing.assert_allclose(run.task.noisy, (1 / 3, 1))
+    assert run.task.sensor_shares == (False, True)
+    assert covers_sensor(run.task, 0.15)
+    assert not covers_sensor(run.task, 0.149)
+    assert "noise of up to 0.05 m on x and 0.15 m on y" in str(run.verdict.reasons)
+    assert any("within that bound: uniform 0.05" in reason for reason in run.verdict.reasons)
+    arc = hyrl_mj.simulate(run.task, run.controller, [0.0, 0.3], Noise("sensor"))
+    assert arc.measured[1, 0] == arc.z[0, 0]
+    assert "--noise 'uniform 0.05 + bias 0.05 + delay 1'" in beginning(run)
+    words = ("--start", "0", "0.3", "--noise")
+    assert cli.dispatch(["simulate", str(late.path), *words, "gaussian 0.02 + hold 2"]) is None
+    with pytest.raises(BadInput, match="leave eps out"):
+        cli.dispatch(["simulate", str(late.path), *words, "bias 0.1", "--eps", "0.1"])
+
+
+@pytest.mark.slow
+def test_noisy_episodes_have_the_sensor_among_their_kinds(late):
+    run = hyrl_mj.load_run(late.path)
+    examine_run(run, ExamineOptions(episodes=20))
+    kinds = {count.noise for count in hyrl_mj.load_run(late.path).robustness.episodes}
+    assert kinds == {*KINDS, SENSOR}
+    examine_run(run, ExamineOptions(episodes=20, eps=0.05))  # which does not cover the sensor
+    kinds = {count.noise for count in hyrl_mj.load_run(late.path).robustness.episodes}
+    assert kinds == {*KINDS}
+
+
+@pytest.mark.slow
+def test_a_robot_declares_its_sensors_once(tmp_path):
+    shutil.copytree(ROOT / "models" / "common", tmp_path / "common")
+    shutil.copy(ROOT / "models" / "vehicle.xml", tmp_path / "late.xml")
+    file = tmp_path / "late.py"
+    file.write_text(
+        "from hyrl_mj.tasks.vehicle import Vehicle\n\n\nclass Late(Vehicle):\n    name = 'late'\n"
+        "    env_id = 'hyrl_mj/Late-v0'\n"
+        "    sensor = 'bias 0.02 + delay 1'\n"
+    )
+    task = hyrl_mj.get_task(file)
+    for options, noise in (({}, 0.07), ({"eps": 0.1}, 0.1), ({"noise": "bias 0.04"}, 0.04)):
+        assert settings_of(task, RunOptions(**options)).noise == noise
+
+
+@pytest.mark.parametrize(
+    "options", [{"eps": 0.1}, {"all_coordinates": True}], ids=["a bound", "all coordinates"]
+)
+def test_a_sensor_tells_its_own_bounds(options, tmp_path):
+    with pytest.raises(BadInput, match="leave eps and all_coordinates out"):
+        hyrl_mj.run(VEHICLE, noise="bias 0.1", out=tmp_path / "run", **options)
+    assert not (tmp_path / "run").exists()
