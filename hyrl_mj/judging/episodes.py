@@ -15,7 +15,7 @@ from hyrl_mj.judging.game import NO_NOISE, Comparison, Ends, EpisodeCount, compa
 from hyrl_mj.physics.plant import Plant
 from hyrl_mj.policies import Controller
 from hyrl_mj.sets import Grid, check_points, distance_to
-from hyrl_mj.simulation import LoopSettings, Noise, Rollout, closed_loop, judge
+from hyrl_mj.simulation import LoopSettings, NamedNoise, Rollout, closed_loop, judge
 from hyrl_mj.system import cores
 from hyrl_mj.system.progress import progress_bar
 from hyrl_mj.tasks import Outcome, Task
@@ -103,7 +103,7 @@ def noisy_episodes(
     task: Task,
     regions: Regions,
     controllers: Mapping[str, Controller],
-    noises: Sequence[Noise],
+    noises: Sequence[NamedNoise],
     count: int,
     seed: int = 0,
 ) -> NoisyEpisodes:
@@ -142,7 +142,7 @@ def noisy_episodes(
     # The plants are used again: new ones for each batch would fragment the memory.
     plants = {} if cores.given() else {n: task.plant(n) for n in {batch.n for batch in batches}}
     counts: list[EpisodeCount] = []
-    ends: dict[Noise, dict[str, Ends]] = {}
+    ends: dict[str, dict[str, Ends]] = {}
     with progress_bar(None, "noisy episodes", "episodes", count * len(pairs)) as progress:
         ended = cores.spread(partial(_play, plants), batches)
         for noise, name in pairs:
@@ -151,10 +151,9 @@ def noisy_episodes(
                 played.append(batch)
                 progress.update(min(BATCH, count - first))
             counts += _count(noise, name, played)
-            ends.setdefault(noise, {})[name] = _joined([batch.ends for batch in played])
-    quiet = next((own for noise, own in ends.items() if noise.kind == NO_NOISE), None)
-    noisy = [noise for noise in ends if noise.kind != NO_NOISE]
-    comparisons = [compare(noise.kind, quiet, ends[noise]) for noise in noisy] if quiet else []
+            ends.setdefault(noise.kind, {})[name] = _joined([batch.ends for batch in played])
+    quiet = ends.pop(NO_NOISE, None)
+    comparisons = [compare(kind, quiet, own) for kind, own in ends.items()] if quiet else []
     return NoisyEpisodes(tuple(counts), tuple(comparisons))
 
 
@@ -174,7 +173,7 @@ class _Batch:
     task: Task
     regions: Regions
     controller: Controller
-    noise: Noise
+    noise: NamedNoise
     seed: int
     first: int
     n: int
@@ -215,7 +214,7 @@ def _joined(parts: Sequence[Ends]) -> Ends:
     return Ends(*(np.concatenate(arrays) for arrays in zip(*map(astuple, parts), strict=True)))
 
 
-def _count(noise: Noise, name: str, batches: Sequence[_Played]) -> Iterator[EpisodeCount]:
+def _count(noise: NamedNoise, name: str, batches: Sequence[_Played]) -> Iterator[EpisodeCount]:
     """Yields how the episodes of each region ended."""
     outcome = np.concatenate([batch.outcome for batch in batches])
     for region in batches[0].regions:

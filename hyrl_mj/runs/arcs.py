@@ -23,7 +23,7 @@ from hyrl_mj.simulation import (
     AnyNoise,
     HybridArc,
     Noise,
-    Sensor,
+    noise_of,
     noise_kinds,
     samples,
     simulate_batch,
@@ -72,9 +72,9 @@ def noisy_arcs(
     """
     task = run.task  # first: the file of a user's task may register noise
     kinds = (*noise_kinds(), "worst", "attack")
-    sensor = Sensor.parse(noise) if " " in noise.strip() else None
+    sensor = noise_of(noise, 0.0) if " " in noise.strip() else None
     if sensor is None and noise not in kinds:
-        raise unknown("noise", noise, [*kinds, "a sum of parts as 'uniform 0.05 + delay 1'"])
+        raise unknown("noise", noise, [*kinds, "a sum as 'uniform 0.05 + delay 1'", "'log LOG.csv'"])
     if sensor is not None and eps is not None:
         raise BadInput(f"the noise {noise!r} tells its own bounds: leave eps out")
     bound = task.check_noise(run.settings.noise if eps is None else eps)

@@ -12,6 +12,7 @@ from hyrl_mj.simulation.arc import LONGEST, HybridArc, samples, simulate, simula
 from hyrl_mj.simulation.attack_settings import AttackSettings
 from hyrl_mj.simulation.checked_noise import drawn
 from hyrl_mj.simulation.lookahead import Ahead, Lookahead
+from hyrl_mj.simulation.logged import Logged, NamedNoise, noise_of
 from hyrl_mj.simulation.noise import (
     KINDS,
     NOT_STARTED,
@@ -45,7 +46,9 @@ __all__ = [
     "AttackSettings",
     "HybridArc",
     "Lookahead",
+    "Logged",
     "LoopSettings",
+    "NamedNoise",
     "Noise",
     "Passing",
     "Programmes",
@@ -63,6 +66,7 @@ __all__ = [
     "judge",
     "judge_task",
     "noise_kinds",
+    "noise_of",
     "policy_runs",
     "register_noise",
     "samples",

@@ -197,7 +197,7 @@ class Sensor:
     """
 
     parts: tuple[Part, ...]
-    kind: ClassVar[str] = SENSOR
+    everywhere: ClassVar[bool] = False
 
     @staticmethod
     def parse(text: str) -> Sensor:
@@ -219,6 +219,11 @@ class Sensor:
 
     def __str__(self) -> str:
         return " + ".join(map(str, self.parts))
+
+    @property
+    def kind(self) -> str:
+        """Its text, by which runs under it are called."""
+        return str(self)
 
     @property
     def bound(self) -> float:
