@@ -25,6 +25,7 @@ from hyrl_mj.simulation.noise import (
     signal_for,
     usual_kinds,
 )
+from hyrl_mj.simulation.noise_of_logs import ColumnNoise, LogNoise, noise_from_log
 from hyrl_mj.simulation.passing import Passing, windings
 from hyrl_mj.simulation.programmes import GIVEN, Programmes
 from hyrl_mj.simulation.real import judge, judge_task
@@ -40,7 +41,9 @@ __all__ = [
     "Ahead",
     "AnyNoise",
     "AttackSettings",
+    "ColumnNoise",
     "HybridArc",
+    "LogNoise",
     "Lookahead",
     "LoopSettings",
     "Noise",
@@ -57,6 +60,7 @@ __all__ = [
     "drawn",
     "judge",
     "judge_task",
+    "noise_from_log",
     "noise_kinds",
     "policy_runs",
     "register_noise",
