@@ -19,7 +19,7 @@ LONGEST_DELAY = 100  # [samples]: later than that no controller can act upon
 LEAST = 50  # samples: fewer do not tell noise from motion
 # With which a test finds what is not there: once in 10,000 columns.
 CHANCE = 1e-4
-ENDS = 0.005, 0.995  # quantiles between which drift is taken: beyond them is mostly noise
+ENDS = 0.001, 0.999  # quantiles between which drift is taken: beyond them is mostly noise
 MOST_LAGS = 40  # of the autocorrelation [samples]
 # Ratios of a measurement to its reference that are a mistake about units.
 UNITS = {
@@ -112,14 +112,24 @@ class LogNoise:
     @property
     def worst(self) -> ColumnNoise:
         """The worst of each quantity of all columns."""
-        widest = max(self.columns, key=lambda column: (column.uniform, column.bound))
-        quantities = ("delay", "held", "held_rate", "quantum", "bias", "drift", "drift_rate")
-        worst = {}
-        for name in quantities:
+
+        def most(name: str) -> float:
             values = np.abs([getattr(column, name) for column in self.columns])
-            worst[name] = float(np.nanmax(values)) if np.isfinite(values).any() else nan
-        worst |= {name: max(getattr(c, name) for c in self.columns) for name in ("bound", "sigma")}
-        return replace(widest, name="all", **worst | {"held": int(worst["held"])})
+            return float(np.nanmax(values)) if np.isfinite(values).any() else nan
+
+        return replace(
+            max(self.columns, key=lambda column: (column.uniform, len(column.errors))),
+            name="all",
+            delay=most("delay"),
+            held=int(most("held")),
+            held_rate=most("held_rate"),
+            quantum=most("quantum"),
+            bias=most("bias"),
+            drift=most("drift"),
+            drift_rate=most("drift_rate"),
+            bound=most("bound"),
+            sigma=most("sigma"),
+        )
 
     @property
     def text(self) -> str:
@@ -280,7 +290,7 @@ def _noise(
     again[: np.argmin(again | (np.arange(len(y)) <= np.argmax(known)))] = False  # before it moves
     quantum = _quantum(y[known & ~again], int(known.sum()), tiny)
     # A quantum repeats measurements, too: held are those which are repeated where the reference moves on.
-    fresh, delay, said = known if quantum else known & ~again, nan, []
+    fresh, delay, said = known if quantum else known & ~again, nan, list[str]()
     for _ in range(2 if quantum else 1):
         if r is not None:
             delay, said = _delay(name, y, r, fresh, turn)
@@ -395,7 +405,7 @@ def _delay(
     most = min(LONGEST_DELAY, len(y) // 8)
     lags = np.arange(-most // 10, most + 1)
     squares = np.full(len(lags), np.inf)
-    for i, lag in enumerate(lags):
+    for i, lag in enumerate(lags.tolist()):
         error = y - _shifted(r, lag)
         error = error[fresh & np.isfinite(error)]
         if len(error) >= LEAST:
@@ -524,6 +534,9 @@ def _drift(error: np.ndarray, dt: float, tiny: float) -> tuple[np.ndarray, float
         window // 4 * 2 + 1, 5
     )  # corners are cut less where a parabola is fitted to half of it
     smooth = scipy.signal.savgol_filter(means, half, 2)
+    # A parabola is uncertain at its ends: there, a line.
+    line = scipy.signal.savgol_filter(means, half, 1)
+    smooth[: half // 2], smooth[-half // 2 :] = line[: half // 2], line[-half // 2 :]
     centres = (np.arange(len(means)) + 0.5) * length - 0.5
     slow = np.interp(np.arange(n), centres, smooth)
     return (
