@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hyrl_mj.errors import BadInput, brief
+from hyrl_mj.errors import BadInput, brief, has_controls
 
 LARGEST = 2**26  # [bytes]: a million rows of six columns
 NEEDED = "give a CSV file with a line of names and a row for each sample"
@@ -81,6 +81,10 @@ def _check(path: str | Path, header: Sequence[str]) -> None:
         raise BadInput(f"{path} is empty or begins with an empty line: {NEEDED}")
     twice = [name for name, count in Counter(header).items() if count > 1]
     for name in header:
+        if has_controls(name):
+            raise BadInput(
+                f"{path} has the name {name[:SHOWN]!r}, with control characters: {NEEDED}"
+            )
         try:
             float(name)
         except ValueError:

@@ -19,7 +19,7 @@ LONGEST_DELAY = 100  # [samples]: later than that no controller can act upon
 LEAST = 50  # samples: fewer do not tell noise from motion
 # With which a test finds what is not there: once in 10,000 columns.
 CHANCE = 1e-4
-ENDS = 0.001, 0.999  # quantiles between which drift is taken: beyond them is mostly noise
+ENDS = 0.002, 0.998  # quantiles between which drift is taken: beyond them is mostly noise
 MOST_LAGS = 40  # of the autocorrelation [samples]
 # Ratios of a measurement to its reference that are a mistake about units.
 UNITS = {
@@ -301,8 +301,7 @@ def _noise(
             why = f"{name} has fewer than {LEAST} samples with a reference that are not held"
             return ColumnNoise(name, remarks=(why,))
         kept = np.clip(raw, *np.quantile(raw[used], [(1 - share) / 2, (1 + share) / 2]))
-        even = np.interp(np.arange(len(y)), np.flatnonzero(used), kept[used])
-        slow, drift, rate, unsure = _drift(even, dt, tiny)
+        slow, drift, rate, unsure = _drift(np.where(used, kept, nan), dt, tiny)
         left = raw - slow
         sigma, bound, uniform = _spread(left[used], quantum, share, tiny, drift)
         repeated = _repeated(late + slow, left[used], sigma, quantum, tiny)
@@ -362,8 +361,9 @@ def _noise(
 
 def _check_units(name: str, y: np.ndarray, r: np.ndarray) -> None:
     """Raises `BadInput` if a measurement has another unit than its reference."""
-    moves = scipy.stats.iqr(r, nan_policy="omit")
-    ratio = scipy.stats.iqr(y, nan_policy="omit") / moves if moves else 1.0
+    both = np.isfinite(y) & np.isfinite(r)
+    moves = scipy.stats.iqr(r[both]) if both.any() else 0.0
+    ratio = scipy.stats.iqr(y[both]) / moves if moves else 1.0
     for units, factor in UNITS.items():
         if abs(ratio / factor - 1) < 0.05:
             raise BadInput(
@@ -414,6 +414,8 @@ def _delay(
             squares[i] = np.mean(scipy.signal.detrend(error, bp=parts) ** 2)
     i = int(np.clip(np.argmin(squares), 1, len(lags) - 2))
     beside, best = squares[[i - 1, i + 1]], max(squares[i], 1e-300)
+    if not np.isfinite(beside).all():
+        return nan, [f"{name} has too few samples with a reference for a delay to be told"]
     # Twice the logarithm of the likelihood ratio of the next best delay.
     sure = fresh.sum() * np.log(max(beside.min(), best) / best)
     if sure < scipy.stats.chi2.isf(CHANCE, 1):
@@ -499,13 +501,14 @@ def _held(again: np.ndarray, moves: np.ndarray, chance: float) -> tuple[int, flo
 
 
 def _drift(error: np.ndarray, dt: float, tiny: float) -> tuple[np.ndarray, float, float, bool]:
-    """Returns bias and drift (n,) of an error (n,), the drift's bound, its rate, and whether that is unsure.
+    """Returns bias and drift (n,), the bound of the drift, its rate, and whether that is unsure.
+
+    The error (n,) is NaN where it is not known.
 
     White noise leaves the means of blocks uncorrelated; drift is where, for some length of the blocks, more
     than half of their variance goes on in the next one.
     """
-    n, persists = len(error), np.ptp(error) < tiny
-    length = 8
+    n, known, persists, length = len(error), np.isfinite(error), False, 8
     while n // length >= 16 and not persists:
         means = _means(error, length)
         means -= means.mean()
@@ -513,12 +516,13 @@ def _drift(error: np.ndarray, dt: float, tiny: float) -> tuple[np.ndarray, float
         enough = scipy.stats.norm.isf(CHANCE) / np.sqrt(len(means))
         persists = bool(correlation > max(0.5, enough))
         length *= 2
-    if not persists or np.ptp(error) < tiny:
-        return np.full(n, error.mean()), 0.0, 0.0, False
+    if not persists or np.ptp(error[known]) < tiny:
+        return np.full(n, error[known].mean()), 0.0, 0.0, False
     # 2,000 blocks are more than the turns of a drift that can be told.
     length = max(1, n // 2_000)
     means, each = _means(error, length), length * dt
-    sigma = np.sqrt(np.mean(np.diff(error, 2) ** 2) / 6 / length)  # white noise: a slope has none
+    # Of white noise, by second differences, which a slope does not change; and of the mean of a block.
+    sigma = np.sqrt(np.nanmean(np.diff(error, 2) ** 2) / 6 / (length * known.mean()))
     best = np.inf, 5, 0.0
     for window in np.unique((5 * 1.25 ** np.arange(40)).astype(int) // 2 * 2 + 1):
         if window > len(means) // 4:
@@ -548,9 +552,11 @@ def _drift(error: np.ndarray, dt: float, tiny: float) -> tuple[np.ndarray, float
 
 
 def _means(values: np.ndarray, length: int) -> np.ndarray:
-    """Returns the means of blocks of that length, (n // length,)."""
-    blocks = len(values) // length
-    return np.asarray(values[: blocks * length].reshape(blocks, length).mean(axis=1))
+    """Returns the means of blocks of that length, (n // length,), where there are values."""
+    blocks = values[: len(values) // length * length].reshape(-1, length)
+    counts = np.isfinite(blocks).sum(axis=1)
+    some = np.flatnonzero(counts)
+    return np.interp(np.arange(len(blocks)), some, np.nansum(blocks[some], axis=1) / counts[some])
 
 
 def _spread(

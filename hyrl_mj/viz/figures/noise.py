@@ -44,7 +44,7 @@ def draw_noise(noise: LogNoise, path: Path | None = None) -> Figure:
             for sign in (-1, 1) if c.bound else ():
                 bound = c.slow + sign * (c.bound + c.quantum / 2)
                 label = {"label": "bound"} if sign == 1 else {}
-                time.plot(c.times, bound, color=colours.MODES[1], linewidth=1.5, **label)
+                time.plot(c.times, bound, color=colours.MODES[1], linewidth=1, **label)
             time.margins(x=0)
             part.legend(loc="outside upper right", ncols=2)
             histogram.set(title="what is left", xlabel="error", yticks=[])
@@ -52,7 +52,7 @@ def draw_noise(noise: LogNoise, path: Path | None = None) -> Figure:
             for bound in np.array([-1, 1]) * (c.bound + c.quantum / 2):
                 histogram.axvline(bound, color=colours.MODES[1], linewidth=2)
             correlation.set(title="autocorrelation", xlabel="lag [samples]", ylim=(-1.05, 1.05))
-            correlation.stem(c.correlations, basefmt=" ", markerfmt=" ")
+            correlation.vlines(np.arange(len(c.correlations)), 0, c.correlations, **looks)
         if path is not None:
             with artifacts.replacing(path) as png:
                 figure.savefig(png, dpi=DPI)
