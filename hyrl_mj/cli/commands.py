@@ -6,6 +6,7 @@ import shlex
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from hyrl_mj import pipeline
 from hyrl_mj.environments import EnvironmentOptions, chosen_task, explained
@@ -17,8 +18,9 @@ from hyrl_mj.pipeline import AgentOptions, ExamineOptions, RunOptions, SweepOpti
 from hyrl_mj.policies import check_agent_file
 from hyrl_mj.runs.arcs import noisy_arcs
 from hyrl_mj.runs.directory import Run
+from hyrl_mj.simulation import noise_from_log
 from hyrl_mj.tasks import Task, get_task, task_names, write_task
-from hyrl_mj.viz import ReplayOptions, print_robustness, print_summary, print_sweep
+from hyrl_mj.viz import ReplayOptions, print_noise, print_robustness, print_summary, print_sweep
 
 
 def list_tasks() -> None:
@@ -228,6 +230,56 @@ def robustness(run: Run, options: ExamineOptions) -> None:
         print(f"pictures in {run.path / 'figures'}")
 
 
+def noise(
+    log: Path,
+    *,
+    columns: tuple[str, ...] | None = None,
+    dt: float | None = None,
+    at_rest: bool = False,
+    scale: dict[str, Any] | None = None,
+    turn: tuple[str, ...] | None = None,
+    share: float = 0.999,
+    out: Path | None = None,
+    force: bool = False,
+) -> None:
+    """Find out from a log of measurements which noise to give to a run.
+
+    LOG is a CSV file with a line of names: t or time [s], measured columns, and beside each NAME what is
+    true as NAME_ref. Numbers are in the units of the log. Without --out nothing is written.
+
+    Args:
+        log: the CSV file.
+        columns: the measured columns to look at; by default all that have a NAME_ref, and at rest all.
+        dt: the time between two rows [s]; by default from the column t or time.
+        at_rest: the robot stood still while the log was written, so no references are needed.
+        scale: factors by which columns are multiplied, as x=0.001 x_ref=0.001 for mm; by default 1.
+        turn: columns of angles in rad, whose difference by a whole turn is none; by default none.
+        share: the share of the samples that is to be within the bound of the noise.
+        out: the png to write: errors, their histogram and their autocorrelation; by default none.
+        force: overwrite a file that hyrl-mj has not written.
+    """
+    try:
+        factors = {name: float(factor) for name, factor in (scale or {}).items()}
+    except ValueError as error:
+        raise BadInput(f"--scale cannot be used ({error}): give NAME=NUMBER, as x=0.001") from None
+    found = noise_from_log(
+        log,
+        columns=columns,
+        dt=dt,
+        at_rest=at_rest,
+        scale=factors,
+        turn=turn or (),
+        share=share,
+    )
+    print_noise(found)
+    if out is not None:
+        from hyrl_mj.viz.figures.noise import draw_noise
+
+        with trust.output(out, force=force):
+            draw_noise(found, out)
+        print(f"picture at {out}")
+
+
 def replay(
     run: Run,
     *,
@@ -385,6 +437,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "extended-sets": extended_sets,
     "retrain": stage_command("retrain", "Run stage 6 again: train the policy of each mode."),
     "robustness": robustness,
+    "noise": noise,
     "simulate": simulate,
     "figures": stage_command("figures", "Draw the paper's figures of a run again, as PNG and PDF."),
     "replay": replay,

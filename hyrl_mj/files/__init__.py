@@ -3,4 +3,4 @@
 Every file is written under a temporary name and renamed, and nothing that is read is a pickle.
 """
 
-__all__ = ["archives", "artifacts", "manifest", "sources", "trust"]
+__all__ = ["archives", "artifacts", "logs", "manifest", "sources", "trust"]

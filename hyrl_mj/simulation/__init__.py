@@ -27,6 +27,7 @@ from hyrl_mj.simulation.noise import (
     signal_for,
     usual_kinds,
 )
+from hyrl_mj.simulation.noise_of_logs import ColumnNoise, LogNoise, noise_from_log
 from hyrl_mj.simulation.passing import Passing, windings
 from hyrl_mj.simulation.programmes import GIVEN, Programmes
 from hyrl_mj.simulation.real import judge, judge_task
@@ -44,7 +45,9 @@ __all__ = [
     "Ahead",
     "AnyNoise",
     "AttackSettings",
+    "ColumnNoise",
     "HybridArc",
+    "LogNoise",
     "Lookahead",
     "Logged",
     "LoopSettings",
@@ -65,6 +68,7 @@ __all__ = [
     "drawn",
     "judge",
     "judge_task",
+    "noise_from_log",
     "noise_kinds",
     "noise_of",
     "policy_runs",

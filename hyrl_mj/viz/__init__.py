@@ -8,7 +8,7 @@ from hyrl_mj.viz.commands import beginning
 from hyrl_mj.viz.options import ReplayOptions
 from hyrl_mj.viz.sweep_tables import print_sweep
 from hyrl_mj.viz.tables import replay_sentence, robustness_sentence
-from hyrl_mj.viz.terminal import print_robustness, print_summary
+from hyrl_mj.viz.terminal import print_noise, print_robustness, print_summary
 
 __all__ = [
     "ReplayOptions",
@@ -17,6 +17,7 @@ __all__ = [
     "drives",
     "encoding",
     "figures",
+    "print_noise",
     "print_robustness",
     "print_summary",
     "print_sweep",

@@ -22,7 +22,7 @@ from hyrl_mj.judging.game import (
     percent,
 )
 from hyrl_mj.runs.directory import Run
-from hyrl_mj.simulation import HybridArc
+from hyrl_mj.simulation import HybridArc, LogNoise
 from hyrl_mj.tasks import Task
 
 # With more modes than these, headings hold their numbers alone.
@@ -305,6 +305,28 @@ def robustness_sentence(robustness: Robustness) -> str:
         for count in robustness.deciding.replays
     ]
     return f"worst case at noise {hyrl.eps:g}, of the winnable starts: {', '.join(shares)}"
+
+
+# ---- logs
+
+
+def noise_table(noise: LogNoise) -> Table:
+    """Returns the noise of a log: a row for each column; "-" is what the log does not tell."""
+
+    def told(value: float, unit: str = "") -> str:
+        return "-" if np.isnan(value) else f"{value:.3g}{unit}"
+
+    rows = []
+    for c in noise.columns:
+        if not len(c.errors):
+            rows.append([c.name, *["-"] * 8])
+            continue
+        held = f"{c.held}, {100 * c.held_rate:.1f}%" if c.held else "0"
+        drift = f"{c.drift:.3g}, {c.drift_rate:.3g}/s" if c.drift else "0"
+        row = [c.name, told(c.delay), held, told(c.quantum), told(c.bias), drift]
+        rows.append([*row, told(c.bound), told(c.sigma), f"{c.correlation:.2f}"])
+    headings = ("", "delay", "held", "quantum", "bias", "drift", "bound", "sigma", "lag 1")
+    return Table("noise, in the units of the log; delay and held in samples", headings, rows)
 
 
 # ---- sets

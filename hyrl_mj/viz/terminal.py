@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from hyrl_mj.runs.directory import Run
+from hyrl_mj.simulation import LogNoise
 from hyrl_mj.viz.tables import (
     NAMES,
     Table,
@@ -11,6 +12,7 @@ from hyrl_mj.viz.tables import (
     episode_table,
     extent,
     margin_table,
+    noise_table,
     replay_sentence,
     replay_table,
     replays_table,
@@ -60,6 +62,17 @@ def print_robustness(run: Run) -> None:
         print_table(signals_table(run.task, attacks))
     if comparisons := run.robustness.comparisons:
         print_table(comparison_table(run.task, comparisons))
+
+
+def print_noise(noise: LogNoise) -> None:
+    """Prints the noise of a log: a table, what it does not tell, and the noise to give to a run."""
+    print_table(noise_table(noise))
+    for remark in (*noise.remarks, *(text for column in noise.columns for text in column.remarks)):
+        print(f"- {remark}")
+    if len({column.text for column in noise.columns}) > 1:
+        for column in noise.columns:
+            print(f"{column.name}: {column.text}")
+    print(f'hyrl-mj run TASK --noise "{noise.text}"')
 
 
 def print_table(table: Table) -> None:

@@ -1,0 +1,109 @@
+"""Logs of measurements: CSV files of strangers, read within limits."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from array import array
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from hyrl_mj.errors import BadInput, brief, has_controls
+
+LARGEST = 2**26  # [bytes]: a million rows of six columns
+NEEDED = "give a CSV file with a line of names and a row for each sample"
+SHOWN = 40  # characters of a cell or a name in a message
+
+
+def read_log(
+    path: str | Path, pick: Callable[[Sequence[str]], Sequence[str]]
+) -> dict[str, np.ndarray]:
+    """Returns columns of a CSV file by their names, each (rows,); NaN where a cell is empty.
+
+    Args:
+        path: the file.
+        pick: returns the names of the columns to read, given all.
+
+    Raises:
+        BadInput: the file cannot be read, or something in it cannot be used.
+    """
+    reader = csv.reader(io.StringIO(_text(Path(path))), strict=True, skipinitialspace=True)
+    try:
+        header = [name.strip() for name in next(reader, [])]
+        _check(path, header)
+        names = pick(header)
+        places = [header.index(name) for name in names]
+        values = [array("d") for _ in names]
+        for row in reader:
+            if not row:
+                continue
+            if len(row) != len(header):
+                raise BadInput(
+                    f"{path}, line {reader.line_num} has {len(row)} cells under {len(header)} names: "
+                    "give each row as many"
+                )
+            for place, column in zip(places, values, strict=True):
+                column.append(_number(row[place], f"{path}, line {reader.line_num}", header[place]))
+    except csv.Error as error:
+        raise BadInput(f"{path} is no CSV file ({brief(error)}): {NEEDED}") from None
+    return {name: np.array(column) for name, column in zip(names, values, strict=True)}
+
+
+def _text(path: Path) -> str:
+    if path.exists() and not path.is_file():
+        raise BadInput(f"{path} is no file: {NEEDED}")
+    try:
+        with path.open("rb") as file:
+            content = file.read(LARGEST + 1)
+    except (OSError, ValueError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise BadInput(f"{path} cannot be read ({why}): {NEEDED}") from None
+    if len(content) > LARGEST:
+        raise BadInput(
+            f"{path} is larger than {LARGEST >> 20} MiB: give fewer rows, or only the columns that are needed"
+        )
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = "\0"
+    if "\0" in text:
+        raise BadInput(f"{path} is no text: {NEEDED}")
+    return text
+
+
+def _check(path: str | Path, header: Sequence[str]) -> None:
+    """Raises `BadInput` unless the first line of a file names its columns."""
+    if not any(header):
+        raise BadInput(f"{path} is empty or begins with an empty line: {NEEDED}")
+    twice = [name for name, count in Counter(header).items() if count > 1]
+    for name in header:
+        if has_controls(name):
+            raise BadInput(
+                f"{path} has the name {name[:SHOWN]!r}, with control characters: {NEEDED}"
+            )
+        try:
+            float(name)
+        except ValueError:
+            continue
+        raise BadInput(f"{path} begins with the number {name[:SHOWN]}, not with names: {NEEDED}")
+    if twice:
+        raise BadInput(f"{path} names the column {twice[0][:SHOWN]!r} twice: give it once")
+
+
+def _number(cell: str, where: str, name: str) -> float:
+    """Returns the number in a cell, NaN for an empty one, or raises `BadInput`."""
+    cell = cell.strip()
+    try:
+        value = float(cell) if cell else math.nan
+    except ValueError:
+        value = math.inf
+    if math.isinf(value):
+        raise BadInput(
+            f"{where}: {name[:SHOWN]} is {cell[:SHOWN]!r}, which is no finite number: give one, or leave the "
+            "cell empty"
+        )
+    return value

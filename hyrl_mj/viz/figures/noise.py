@@ -1,0 +1,59 @@
+"""The figure of the noise of a log: errors over time, their histogram, and their autocorrelation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib import style as styles
+from matplotlib.figure import Figure
+
+from hyrl_mj.errors import BadInput
+from hyrl_mj.files import artifacts
+from hyrl_mj.simulation import LogNoise
+from hyrl_mj.viz import colours
+from hyrl_mj.viz.figures.style import DPI, STYLE, WIDTH, grid_lines
+
+MOST = 8  # rows: more cannot be read
+# Letters of 13 points on 7.8 inches can be read where the figure is 400 pixels wide.
+SIZES = {"font.size": 13, "axes.titlesize": 13, "legend.fontsize": 12}
+
+
+def draw_noise(noise: LogNoise, path: Path | None = None) -> Figure:
+    """Draws the errors of each column of a log, in its unit, and writes a PNG; the first 8 columns.
+
+    Raises:
+        BadInput: the path does not end in .png.
+    """
+    if path is not None and path.suffix != ".png":
+        raise BadInput(f"--out {path} cannot be written: give a name that ends in .png")
+    columns = [column for column in noise.columns if len(column.errors)][:MOST]
+    with styles.context(["default", STYLE, SIZES]):
+        figure = Figure(figsize=(WIDTH, 0.6 + 4.6 * len(columns)), layout="constrained")
+        parts = figure.subfigures(len(columns), 1, squeeze=False).ravel()
+        for part, c in zip(parts, columns, strict=True):
+            panels = part.subplot_mosaic([["time", "time"], ["histogram", "correlation"]])
+            for panel in panels.values():
+                grid_lines(panel)
+                panel.locator_params(nbins=5)
+            time, histogram, correlation = panels.values()
+            time.set(title=f"{c.name}: error over time", xlabel="t [s]")
+            time.plot(c.times, c.errors, ".", color=colours.PALE, markersize=2, rasterized=True)
+            looks = {"color": colours.MODES[0], "linewidth": 2.5}
+            time.plot(c.times, c.slow, **looks, label="bias and drift")
+            for sign in (-1, 1) if c.bound else ():
+                bound = c.slow + sign * (c.bound + c.quantum / 2)
+                label = {"label": "bound"} if sign == 1 else {}
+                time.plot(c.times, bound, color=colours.MODES[1], linewidth=1, **label)
+            time.margins(x=0)
+            part.legend(loc="outside upper right", ncols=2)
+            histogram.set(title="what is left", xlabel="error", yticks=[])
+            histogram.hist(c.errors - c.slow, bins="auto", color=colours.PALE)
+            for bound in np.array([-1, 1]) * (c.bound + c.quantum / 2):
+                histogram.axvline(bound, color=colours.MODES[1], linewidth=2)
+            correlation.set(title="autocorrelation", xlabel="lag [samples]", ylim=(-1.05, 1.05))
+            correlation.vlines(np.arange(len(c.correlations)), 0, c.correlations, **looks)
+        if path is not None:
+            with artifacts.replacing(path) as png:
+                figure.savefig(png, dpi=DPI)
+    return figure

@@ -1,0 +1,298 @@
+"""The noise of a sensor is found in logs in which it was planted; what a log does not tell is said."""
+
+import numpy as np
+import pytest
+from command_line import call
+from PIL import Image
+from scipy import signal, stats
+
+from hyrl_mj import BadInput, noise_from_log
+from hyrl_mj.files import logs
+
+
+def moved(t, amplitude=1.0):
+    """What is true [m]: a motion with two periods."""
+    return amplitude * (np.sin(0.7 * t) + 0.5 * np.sin(1.6 * t + 1))
+
+
+def planted(
+    seed, dt, amplitude=1.0, uniform=0.0, gaussian=0.0, bias=0.0, drift=(0.0, 1.0), delay=0,
+    hold=(0, 0.0), lost=False, quantum=0.0, seconds=300,
+):  # fmt: skip
+    """A log of 300 s as columns by their names."""
+    rng, t = np.random.default_rng(seed), np.arange(int(seconds / dt)) * dt
+    n, (bound, rate), (most, share) = len(t), drift, hold
+    x = moved(t, amplitude)
+    slow = bound * signal.sawtooth(2 * np.pi * (t * rate / (4 * max(bound, 1e-9)) + seed / 3), 0.5)
+    sent = x + bias + slow + rng.uniform(-uniform, uniform, n)
+    sent += gaussian / 3 * stats.truncnorm.rvs(-3, 3, size=n, random_state=rng)
+    if quantum:
+        sent = np.round(sent / quantum) * quantum
+    told = np.concatenate([np.full(delay, sent[0]), sent])[:n]
+    row = 0
+    for k in range(1, n):
+        row = row + 1 if row < most and rng.random() < share else 0
+        told[k] = told[k] if not row else np.nan if lost else told[k - 1]
+    return {"t": t, "x": told, "x_ref": x}
+
+
+def write(path, columns):
+    """Writes a log, with empty cells for NaN."""
+    rows = [",".join(columns)]
+    for row in zip(*columns.values(), strict=True):
+        rows.append(",".join("" if np.isnan(value) else f"{value:.12g}" for value in row))
+    path.write_text("\n".join(rows))
+    return path
+
+
+@pytest.fixture
+def of(tmp_path):
+    """The noise of the first column of a log."""
+    return lambda columns, **how: noise_from_log(
+        write(tmp_path / "log.csv", columns), **how
+    ).columns[0]
+
+
+two_seeds = pytest.mark.parametrize("seed", [0, 1])
+two_times = pytest.mark.parametrize("dt", [0.05, 0.02])
+
+
+# ---- what was planted is found
+
+
+ALONE = {
+    "uniform": ({"uniform": 0.05}, {"bound": 0.05, "sigma": 0.05 / 3**0.5, "uniform": True}),
+    "gaussian": ({"gaussian": 0.06}, {"bound": 0.06, "sigma": 0.02, "uniform": False}),
+    "bias": ({"bias": -0.03}, {"bias": -0.03}),
+    "drift": ({"drift": (0.05, 0.01)}, {"drift": 0.05, "drift_rate": 0.01}),
+    "delay": ({"delay": 3}, {"delay": 3}),
+    "held": ({"hold": (3, 0.3)}, {"held": 3, "held_rate": 0.3}),
+    "lost": ({"hold": (2, 0.2), "lost": True}, {"held": 2, "held_rate": 0.2}),
+    "quantum": ({"quantum": 0.02}, {"quantum": 0.02}),
+}
+NONE = {"bound": 0, "bias": 0, "drift": 0, "delay": 0, "held": 0, "held_rate": 0, "quantum": 0}
+
+
+@pytest.mark.parametrize("kind", ALONE)
+@two_seeds
+@two_times
+def test_each_quantity_is_found_alone_and_nothing_else(kind, seed, dt, of):
+    plan, wanted = ALONE[kind]
+    noise = of(planted(seed, dt, **plan))
+    largest = max(plan.get("drift", (0,))[0], plan.get("uniform", 0), plan.get("quantum", 0), 0.02)
+    for name, value in (NONE | wanted).items():
+        # Where nothing was planted, a twentieth of what was is let pass.
+        tolerance = 0.1 * abs(value) if value else largest / 20
+        assert getattr(noise, name) == pytest.approx(value, abs=tolerance), name
+    assert set(noise.text.split()) & {"uniform", "gaussian", *ALONE, "hold"} == {
+        {"held": "hold", "lost": "hold"}.get(kind, kind)
+    }
+
+
+@pytest.mark.parametrize("scale", [0.1, 1, 30])
+@pytest.mark.parametrize("kind", ["uniform", "gaussian"])
+@two_seeds
+@two_times
+def test_all_together_are_found(scale, kind, seed, dt, of):
+    plan = {"bias": 0.06, "drift": (0.06, 0.01), "quantum": 0.005, kind: 0.04}
+    plan = {k: tuple(scale * np.array(v)) if k == "drift" else scale * v for k, v in plan.items()}
+    noise = of(planted(seed, dt, 3 * scale, delay=2, hold=(2, 0.2), **plan))
+    assert (noise.delay, noise.held, noise.uniform) == (2, 2, kind == "uniform")
+    found = [noise.bound, noise.bias, noise.drift, noise.drift_rate, noise.quantum, noise.held_rate]
+    wanted = [plan[kind], plan["bias"], *plan["drift"], plan["quantum"], 0.2]
+    np.testing.assert_allclose(found, wanted, rtol=0.1)
+
+
+def test_the_text_is_in_the_grammar_of_noise(of):
+    noise = of(planted(0, 0.05, uniform=0.05, bias=-0.02, delay=1, hold=(2, 0.2)))
+    words = [part.split()[0] for part in noise.text.split(" + ")]
+    assert words == ["uniform", "bias", "delay", "hold"]
+    assert float(noise.text.split(" + ")[1].split()[1]) > 0  # a bound
+
+
+def test_a_deviation_that_is_no_third_of_the_bound_is_said(of):
+    log = planted(0, 0.05)
+    log["x"] += np.clip(np.random.default_rng(0).laplace(0, 0.01, len(log["x"])), -0.06, 0.06)
+    noise = of(log)
+    assert noise.text.startswith("gaussian 0.06")
+    assert noise.sigma == pytest.approx(0.01 * 2**0.5, rel=0.1)
+    assert f" sigma {noise.sigma:.3g}" in noise.text
+
+
+def test_the_worst_of_each_quantity_is_given_for_all(tmp_path):
+    a, b = planted(0, 0.05, uniform=0.02, delay=2), planted(1, 0.05, uniform=0.05, bias=0.1)
+    log = a | {"y": b["x"], "y_ref": b["x_ref"]}
+    path = write(tmp_path / "log.csv", log)
+    worst = noise_from_log(path).worst
+    assert worst.bound == pytest.approx(0.05, rel=0.1)
+    assert worst.bias == pytest.approx(0.1, rel=0.1)
+    assert worst.delay == 2
+    assert [c.name for c in noise_from_log(path, columns=["y"]).columns] == ["y"]
+    told = call("noise", path, "--columns", "y,x").stdout
+    assert "x: uniform 0.02 + delay 2\n" in told
+    assert 'hyrl-mj run TASK --noise "uniform 0.0499 + bias 0.1 + delay 2"' in told
+
+
+def test_angles_are_compared_round_the_circle(of):
+    log = planted(0, 0.05, amplitude=3, uniform=0.05, delay=2)
+    log = log | {name: np.mod(log[name], 2 * np.pi) for name in ("x", "x_ref")}
+    noise = of(log, turn=["x"])
+    assert (noise.delay, noise.text) == (2, f"uniform {noise.bound:.3g} + delay 2")
+    assert noise.bound == pytest.approx(0.05, rel=0.1)
+
+
+def test_other_units_are_named_and_scaled(of):
+    log = planted(0, 0.05, uniform=0.05)
+    milli = log | {"x": 1000 * log["x"]}
+    with pytest.raises(BadInput, match=r"as mm against m: give --scale x=0[.]001"):
+        of(milli)
+    assert of(milli, scale={"x": 0.001}).bound == pytest.approx(0.05, rel=0.1)
+    with pytest.raises(BadInput, match=r"as radians against degrees: give --scale x=57[.]29"):
+        of(log | {"x_ref": np.degrees(log["x_ref"])})
+    assert "0.8 times as much" in " ".join(of(log | {"x": 0.8 * log["x"]}).remarks)
+
+
+# ---- what a log does not tell is said
+
+
+def test_at_rest_there_is_no_bias_and_no_delay(of):
+    log = planted(0, 0.05, amplitude=0, uniform=0.05, bias=0.3, hold=(2, 0.2))
+    noise = of({"t": log["t"], "x": log["x"]}, at_rest=True)
+    assert np.isnan(noise.bias)
+    assert np.isnan(noise.delay)
+    assert noise.bound == pytest.approx(0.05, rel=0.1)
+    assert (noise.held, noise.held_rate) == (2, pytest.approx(0.2, rel=0.1))
+    assert noise.remarks == ("without a reference, bias and delay cannot be told",)
+
+
+SAID = {
+    "moves too little for a delay": lambda log: log | {"x": log["x"] - log["x_ref"], "x_ref": 0 * log["t"]},
+    "samples earlier than its reference": lambda log: log | {"x_ref": np.roll(log["x_ref"], 4)},
+    "correlated from sample to sample": lambda log: log
+    | {"x": log["x_ref"] + signal.lfilter([0.01], [1, -0.7], np.random.default_rng(0).normal(size=6000))},
+    "beyond the bound": lambda log: log | {"x": log["x"] + (log["t"] == 200)},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", SAID)
+def test_what_the_log_does_not_tell_is_a_sentence(what, of):
+    noise = of(SAID[what](planted(0, 0.05, uniform=0.02)))
+    assert what in " ".join(noise.remarks)
+
+
+def test_held_samples_are_not_guessed_where_the_quantum_hides_the_motion(of):
+    noise = of(planted(0, 0.05, amplitude=0.1, quantum=0.05, hold=(2, 0.2)))
+    assert "moves too little between samples for held ones to be told" in " ".join(noise.remarks)
+    assert noise.held == 0
+
+
+def test_gaps_and_uneven_times_are_said_and_are_no_lost_samples(tmp_path):
+    log = planted(0, 0.05, uniform=0.05, delay=2)
+    kept = np.r_[:2000, 2100:4000, 4010:6000]
+    found = noise_from_log(write(tmp_path / "a.csv", {k: v[kept] for k, v in log.items()}))
+    assert "2 gaps in time of up to 5.05 s" in " ".join(found.remarks)
+    assert found.text == f"uniform {found.worst.bound:.3g} + delay 2"
+    log["t"] = log["t"] + np.random.default_rng(0).uniform(0, 0.02, 6000)
+    (remark,) = noise_from_log(write(tmp_path / "b.csv", log)).remarks
+    assert "a sample is taken as 0.0499 s" in remark
+
+
+def test_few_rows_are_said(tmp_path):
+    found = noise_from_log(write(tmp_path / "a.csv", planted(0, 0.05, uniform=0.05, seconds=20)))
+    assert "needs 1,000 rows, and the log has 400" in found.remarks[0]
+
+
+def test_a_column_that_never_changes_leaves_the_others(tmp_path):
+    log = planted(0, 0.05, uniform=0.05)
+    log |= {"dead": 0 * log["t"], "dead_ref": log["x_ref"]}
+    path = write(tmp_path / "log.csv", log)
+    assert noise_from_log(path).text.startswith("uniform 0.05")
+    told = call("noise", path).stdout
+    assert "dead never changes, so its noise cannot be told" in told
+    with pytest.raises(BadInput, match="tells no noise: dead never changes"):
+        noise_from_log(path, columns=["dead"])
+
+
+# ---- the command, and files of strangers
+
+
+def test_the_command_draws_and_does_not_overwrite(tmp_path):
+    path = write(tmp_path / "log.csv", planted(0, 0.05, uniform=0.05, drift=(0.05, 0.01)))
+    assert call("noise", path, cwd=tmp_path).returncode == 0
+    assert [*tmp_path.iterdir()] == [path]
+    done = call("noise", path, "--out", "noise.png", cwd=tmp_path)
+    assert done.stdout.endswith("picture at noise.png\n")
+    with Image.open(tmp_path / "noise.png") as picture:
+        colours = np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)
+    assert {(0, 114, 178), (213, 94, 0)} <= {*map(tuple, colours.tolist())}
+    (tmp_path / "mine.png").write_text("mine")
+    refused = call("noise", path, "--out", "mine.png", cwd=tmp_path)
+    assert (refused.returncode, (tmp_path / "mine.png").read_text()) == (2, "mine")
+
+
+ROWS = "".join(f"{k},{k % 7},{k % 5}\n" for k in range(100))
+STRANGE = {
+    "begins with the number": "1,2,3\n" + ROWS,
+    "is empty": "",
+    "has 1 row of samples": "t,x,x_ref\n1,2,3\n",
+    "has 0 rows of samples": "t,x,x_ref\n",
+    "which is no finite number": "t,x,x_ref\n0,a,1\n" + ROWS,
+    "'inf', which is no": "t,x,x_ref\n0,inf,1\n" + ROWS,
+    "line 102: the time does not increase": "t,x,x_ref\n" + ROWS + "5,0,0\n",
+    "names the column 'x' twice": "t,x,x\n" + ROWS,
+    "line 2 has 2 cells": "t,x,x_ref\n0,1\n" + ROWS,
+    "has no column x_ref": "t,x,y\n" + ROWS,
+    "has no measured column": "t\n1\n2\n",
+    "has no column t or time": "s,x,x_ref\n" + ROWS,
+    "fewer than 50 numbers": "t,x,x_ref\n" + "".join(f"{k},nan,1\n" for k in range(100)),
+    "fewer than 50 samples with a reference": "t,x,x_ref\n"
+    + "".join(f"{k},{k % 7},\n" for k in range(100)),
+    "is no CSV file": 't,x,x_ref\n0,"1,2\n' + ROWS,
+    "with control characters": "t,x\x1b[2J,x_ref\n" + ROWS,
+    "is no text": b"\x89PNG\0\xff",
+}
+
+
+@pytest.mark.parametrize("what", STRANGE)
+def test_files_of_strangers_are_a_sentence(what, tmp_path):
+    path, content = tmp_path / "log.csv", STRANGE[what]
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    done = call("noise", path)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+    assert what in done.stderr
+    assert "\x1b" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "what"),
+    [
+        (["--columns", "y"], "unknown measured column"),
+        (["--turn", "y"], "unknown column"),
+        (["--scale", "y=2"], "unknown column"),
+        (["--scale", "x=0"], "give a factor"),
+        (["--scale", "x=mm"], "give NAME=NUMBER"),
+        (["--share", "2"], "from 0.5 to 1"),
+        (["--dt", "0.05"], "leave --dt out"),
+        (["--dt", "0"], "give one > 0"),
+        (["--out", "a.pdf"], "ends in .png"),
+    ],
+)
+def test_wrong_options_are_a_sentence(options, what, tmp_path):
+    write(tmp_path / "log.csv", planted(0, 0.05, uniform=0.05, seconds=60))
+    done = call("noise", "log.csv", *options, cwd=tmp_path)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+    assert what in done.stderr
+
+
+def test_what_is_no_file_or_too_large_is_a_sentence(tmp_path, monkeypatch):
+    assert "is no file" in call("noise", tmp_path).stderr
+    assert "cannot be read" in call("noise", tmp_path / "none.csv").stderr
+    monkeypatch.setattr(logs, "LARGEST", 2**20)
+    (tmp_path / "log.csv").write_bytes(b"1" * (2**20 + 1))
+    assert "is larger than 1 MiB" in call("noise", tmp_path / "log.csv").stderr
+
+
+def test_a_log_without_times_takes_them_as_an_option(of):
+    log = planted(0, 0.05, drift=(0.05, 0.01))
+    del log["t"]
+    assert of(log, dt=0.05).drift_rate == pytest.approx(0.01, rel=0.1)
