@@ -14,7 +14,7 @@ import hyrl_mj
 from hyrl_mj import BadInput, Noise, RunOptions, Sensor, cli
 from hyrl_mj.pipeline import ExamineOptions, examine_run
 from hyrl_mj.pipeline.runs import settings_of
-from hyrl_mj.simulation import KINDS, SENSOR, LoopSettings, closed_loop, covers_sensor
+from hyrl_mj.simulation import KINDS, SENSOR, LoopSettings, closed_loop, covers_sensor, noise_of
 from hyrl_mj.viz import beginning
 
 VEHICLE, CIRCLE = "vehicle", "unit_circle"
@@ -177,6 +177,49 @@ def test_what_cannot_be_sensed_is_refused():
     with pytest.raises(BadInput, match="put Gymnasium's DelayObservation around it"):
         Sensor.parse("delay 1").against(task, None)
     assert Sensor.parse("bias 0.1").on(task)[0] == 0.1
+
+
+# ---- logs
+
+
+@pytest.fixture
+def log(tmp_path):
+    """A log in which y is 0.01 k too high at its k-th sample, and its reference moves."""
+    path, rows = tmp_path / "log.csv", range(400)
+    lines = [f"{0.05 * k:.2f},{np.sin(k / 9) + 1e-4 * k},{np.sin(k / 9)}" for k in rows]
+    path.write_text("\n".join(["t,y,y_ref", *lines]))
+    return path
+
+
+def test_each_run_plays_a_window_of_a_log(log):
+    task = hyrl_mj.get_task(VEHICLE)
+    noise = noise_of(f"log {log}", 0.0)
+    z0 = np.tile([0.0, 0.9], (40, 1))
+    options = LoopSettings(record=True, quiet=True, steps=30)
+    loop = hyrl_mj.policies.PolicyController(Fixed())
+    run = closed_loop(task, loop, z0, noise, seed=0, settings=options)
+    added = run.measured[:, :, 1] - run.true[:-1, :, 1]
+    begun = added[0]
+    assert np.ptp(begun) > 0.02
+    assert begun.min() >= -1e-9
+    assert noise.bound == pytest.approx(399e-4)
+    inside = begun < 0.036  # of those that do not come to the end of the log
+    np.testing.assert_allclose(
+        added[:30, inside], begun[inside] + 1e-4 * np.arange(len(added))[:, None], atol=1.1e-4
+    )
+    around = added[-1] < begun  # the others go on at its beginning
+    assert around.any()
+    assert not (run.measured[:, :, 0] != run.true[:-1, :, 0]).any()
+
+
+def test_what_is_no_log_of_a_task_is_refused(log, tmp_path):
+    with pytest.raises(BadInput, match="rename the columns"):
+        noise_of(f"log {log}", 0.0).against(hyrl_mj.get_task(CIRCLE), None)
+    with pytest.raises(BadInput, match="cannot be read"):
+        noise_of(f"log {tmp_path / 'none.csv'}", 0.0)
+    with pytest.raises(BadInput, match="hyrl-mj noise LOG"):
+        hyrl_mj.run(VEHICLE, noise=f"log {log}", out=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
 
 
 # ---- runs

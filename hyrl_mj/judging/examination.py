@@ -15,7 +15,14 @@ from hyrl_mj.judging.game import MapClass, Maps, Robustness, compare
 from hyrl_mj.judging.worst_case import worst_case
 from hyrl_mj.policies import Controller
 from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.simulation import SENSOR, AttackSettings, HybridArc, covers_sensor, noise_of, usual_kinds
+from hyrl_mj.simulation import (
+    SENSOR,
+    AttackSettings,
+    HybridArc,
+    covers_sensor,
+    noise_of,
+    usual_kinds,
+)
 from hyrl_mj.tasks import Effort, Task
 
 
@@ -27,8 +34,8 @@ class ExamineOptions:
         eps: bound of the noise, in the units of the chart; by default the run's.
         episodes: noisy episodes for each kind of noise and each controller; by default none where the worst
             case can be computed and not only estimated, on charts of one or two dimensions.
-        noise: kinds of noise in the episodes, sums of parts, or logs, as for `hyrl-mj simulate`; by default none,uniform,alternating,adversarial, without the
-            last in environments of others.
+        noise: kinds of noise in the episodes, or sums of parts and logs, as for `hyrl-mj simulate`; by
+            default none,uniform,alternating,adversarial, without the last in environments of others.
         all_coordinates: add noise to every coordinate of the measurement, not only to the noisy ones of the
             task; always, if the run was made so.
         near_critical: start all episodes and the attack within twice the bound of the critical set.

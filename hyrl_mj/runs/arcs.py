@@ -23,8 +23,8 @@ from hyrl_mj.simulation import (
     AnyNoise,
     HybridArc,
     Noise,
-    noise_of,
     noise_kinds,
+    noise_of,
     samples,
     simulate_batch,
 )
@@ -74,7 +74,9 @@ def noisy_arcs(
     kinds = (*noise_kinds(), "worst", "attack")
     sensor = noise_of(noise, 0.0) if " " in noise.strip() else None
     if sensor is None and noise not in kinds:
-        raise unknown("noise", noise, [*kinds, "a sum as 'uniform 0.05 + delay 1'", "'log LOG.csv'"])
+        raise unknown(
+            "noise", noise, [*kinds, "a sum as 'uniform 0.05 + delay 1'", "'log LOG.csv'"]
+        )
     if sensor is not None and eps is not None:
         raise BadInput(f"the noise {noise!r} tells its own bounds: leave eps out")
     bound = task.check_noise(run.settings.noise if eps is None else eps)

@@ -11,8 +11,8 @@ from pkgutil import iter_modules
 from hyrl_mj.simulation.arc import LONGEST, HybridArc, samples, simulate, simulate_batch
 from hyrl_mj.simulation.attack_settings import AttackSettings
 from hyrl_mj.simulation.checked_noise import drawn
-from hyrl_mj.simulation.lookahead import Ahead, Lookahead
 from hyrl_mj.simulation.logged import Logged, NamedNoise, noise_of
+from hyrl_mj.simulation.lookahead import Ahead, Lookahead
 from hyrl_mj.simulation.noise import (
     KINDS,
     NOT_STARTED,
@@ -48,8 +48,8 @@ __all__ = [
     "ColumnNoise",
     "HybridArc",
     "LogNoise",
-    "Lookahead",
     "Logged",
+    "Lookahead",
     "LoopSettings",
     "NamedNoise",
     "Noise",

@@ -74,13 +74,13 @@ class _Windows(Signal):
 
     def reset(self, n: int, rng: np.random.Generator) -> None:
         super().reset(n, rng)
-        self._begun = np.zeros(n)
+        self._window = np.zeros(n)
 
     def sample(self, now: Sample) -> np.ndarray:
         fresh = now.rows[now.k == 0]
         if len(fresh):
-            self._begun[fresh] = self.rng.uniform(0.0, self._time, len(fresh))
-        t = self._first + (self._begun[now.rows] + now.k * self._dt) % self._time
+            self._window[fresh] = self.rng.uniform(0.0, self._time, len(fresh))
+        t = self._first + (self._window[now.rows] + now.k * self._dt) % self._time
         noise = np.zeros_like(now.measurement)
         for i, column in self._columns:
             latest = np.searchsorted(column.times, t, side="right") - 1

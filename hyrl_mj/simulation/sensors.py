@@ -145,6 +145,10 @@ class Part:
             BadInput: it names none, or a number that cannot be.
         """
         word, *rest = text.split() or [""]
+        if word == "log":
+            raise BadInput(
+                f"{text.strip()!r} is no part of a sensor: hyrl-mj noise LOG.csv tells which parts it has"
+            )
         words = [kind for kind in noise_kinds() if kind not in ("none", SENSOR)]
         if word not in (words := [*words, DELAY, HOLD, QUANTUM]):
             raise unknown("part of a sensor", word, words)
