@@ -1,11 +1,15 @@
 """Agents that were trained under `VecNormalize` or `VecFrameStack` see here what they saw there."""
 
+import os
+import pickle
+
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 from planted import random_states
 from stable_baselines3 import DQN, PPO, SAC
-from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
 from test_agents import OFF_POLICY, onnx_file, saved
 
@@ -59,6 +63,68 @@ def agent(algorithm, task, folder, wrap):
         np.savez(folder / "stats.npz", **statistics)
         needs["vecnormalize"] = folder / "stats.npz"
     return model, saved(model, folder), needs
+
+
+class Executes:
+    """Runs code where it is unpickled."""
+
+    def __reduce__(self):
+        return os.system, ("touch executed",)
+
+
+def pickled_statistics(tmp_path, **options):
+    """What `VecNormalize.save` writes after some samples, and the object."""
+    env = VecNormalize(TaskVecEnv(BatchedEnv(hyrl_mj.get_task("unit_circle"), 1)), **options)
+    env.reset()
+    for _ in range(20):
+        env.step(np.array([env.action_space.sample()]))
+    env.save(tmp_path / "stats.pkl")
+    return tmp_path / "stats.pkl", env
+
+
+def test_statistics_are_read_as_sb3_saves_them(tmp_path):
+    path, env = pickled_statistics(tmp_path, clip_obs=3.0, epsilon=1e-4)
+    found, seen = Normalization.load(path), np.random.default_rng(0).normal(size=(50, 2))
+    np.testing.assert_array_equal(found(seen).astype(np.float32), env.normalize_obs(seen))
+    assert (found.clip, found.epsilon) == (3.0, 1e-4)
+
+
+def test_statistics_of_a_dict_are_read_by_its_keys(tmp_path):
+    box = gym.spaces.Box(-1, 1, (2,))
+
+    class Both(gym.Env):
+        observation_space, action_space = gym.spaces.Dict(b=box, a=box), box
+
+        def reset(self, *, seed=None, options=None):
+            return self.observation_space.sample(), {}
+
+        def step(self, action):
+            return self.observation_space.sample(), 0.0, False, False, {}
+
+    env = VecNormalize(DummyVecEnv([Both]))
+    env.reset()
+    env.save(tmp_path / "stats.pkl")
+    found = Normalization.load(tmp_path / "stats.pkl", {"b": 2, "a": 2})
+    means = [env.obs_rms[key].mean for key in ("b", "a")]
+    np.testing.assert_array_equal(found.mean, np.concatenate(means))
+
+
+@pytest.mark.parametrize("what", ["no statistics", "code", "nested", "cut off", "plain"])
+def test_pickles_that_are_no_statistics_are_refused(what, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path, _ = pickled_statistics(tmp_path, norm_obs=what != "plain")
+    if what == "cut off":
+        path.write_bytes(path.read_bytes()[:-40])
+    if what == "code":
+        path.write_bytes(pickle.dumps({"obs_rms": Executes(), "clip_obs": 1.0, "epsilon": 1.0}))
+    if what == "no statistics":
+        path.write_bytes(pickle.dumps({"obs_rms": 3}))
+    if what == "nested":  # keys that double
+        path.write_bytes(b"\x80\x04}(" + b")" + b"2\x86" * 5_000 + b"K\x01u.")
+    told = "did not normalise" if what == "plain" else "no VecNormalize that SB3 has saved"
+    with pytest.raises(BadArtifact, match=told):
+        Normalization.load(path)
+    assert not (tmp_path / "executed").exists()
 
 
 def as_there(model, wrapped, task, measured):

@@ -69,8 +69,9 @@ class AgentOptions:
             default that of SB3's policy.
         stochastic: sample the inputs of the agent, as during its training (PPO, A2C, SAC); noisy episodes
             then replace the worst-case game.
-        vecnormalize: statistics of the VecNormalize that the agent was trained under, an npz file with mean,
-            var, clip and epsilon; or none if it saw plain observations; by default what the agent tells.
+        vecnormalize: statistics of the VecNormalize that the agent was trained under, as its save() wrote
+            them, or an npz file with mean, var, clip and epsilon; or none if it saw plain observations; by
+            default what the agent tells.
         n_stack: the number of observations that the agent sees at once, for one trained under VecFrameStack;
             noisy episodes then replace the worst-case game.
         eps: bound of the measurement noise to survive, in the units of the chart; by default 0.1.

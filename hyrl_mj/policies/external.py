@@ -166,8 +166,9 @@ def load_agent(
         stochastic: draw from the policy's distribution instead of acting by its mean or mode (PPO, A2C,
             SAC). Such a policy is reproducible call by call only.
         seed: the seed of these draws.
-        vecnormalize: an npz file with the statistics of the `VecNormalize` of its training: arrays mean,
-            var, clip, and epsilon; or "none" if it saw plain observations. By default the zip has to tell.
+        vecnormalize: the statistics of the `VecNormalize` of its training: the file that its `save` wrote,
+            or an npz file with arrays mean, var, clip, and epsilon; or "none" if it saw plain observations.
+            By default the zip has to tell.
         n_stack: the number of observations that it sees at once, if it was trained under `VecFrameStack`.
             Its `act` is then the steady answer; in closed loops it acts with its memory.
 

@@ -12,6 +12,7 @@ agent was trained. Python's own unpickler, also with a find_class() of ours, all
 from __future__ import annotations
 
 import pickletools
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -142,13 +143,53 @@ def arrays(content: bytes) -> dict[str, np.ndarray]:
         return {}
     try:
         found = read(content)
-        is_dict = isinstance(found, Call) and found.function in DICTS
-        named = found.items if is_dict else [("", found)]
-        # Only texts are names: others can be nested so that they have no end.
-        values = {name: _array(value) for name, value in named if isinstance(name, str)}
+        named = (
+            entries(found) if isinstance(found, Call) and found.function in DICTS else {"": found}
+        )
+        values = {name: _array(value) for name, value in named.items()}
     except Exception:  # a damaged pickle may raise any error
         return {}
     return {name: value for name, value in values.items() if value is not None}
+
+
+def entries(found: Any) -> dict[str, Any]:
+    """Returns the entries of a dictionary, or the attributes of an object; none of anything else."""
+    if isinstance(found, Call) and found.function not in DICTS:
+        found = found.state
+    if not isinstance(found, Call) or found.function not in DICTS:
+        return {}
+    # Only texts are names: others can be nested so that they have no end.
+    return {name: value for name, value in found.items if isinstance(name, str)}
+
+
+def statistics(content: bytes) -> dict[str, np.ndarray]:
+    """Returns the arrays of a pickled `VecNormalize` by which it normalises observations.
+
+    These are mean, var, clip and epsilon; of a Dict mean.KEY and var.KEY for each key.
+
+    Raises:
+        ValueError: it is none, or did not normalise observations.
+    """
+    found = {}
+    if len(content) <= LARGEST:
+        with suppress(Exception):  # a damaged pickle may raise any error
+            found = entries(read(content))
+    if found.get("norm_obs") is False:
+        raise ValueError("its VecNormalize did not normalise observations: give none in its place")
+    sums = found.get("obs_rms")
+    whole = {"": sums} if "mean" in entries(sums) else entries(sums)
+    named = {
+        f"{name}.{key}" if key else name: _array(entries(one).get(name))
+        for key, one in whole.items()
+        for name in ("mean", "var")
+    }
+    numbers = {name: found.get(key) for name, key in (("clip", "clip_obs"), ("epsilon", "epsilon"))}
+    values = {
+        n: np.array(x) if isinstance(x, int | float) else _array(x) for n, x in numbers.items()
+    }
+    if not named or any(value is None for value in (*named.values(), *values.values())):
+        raise ValueError("it is no VecNormalize that SB3 has saved")
+    return {name: value for name, value in {**named, **values}.items() if value is not None}
 
 
 def _array(found: Any) -> np.ndarray | None:

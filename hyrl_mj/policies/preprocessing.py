@@ -13,6 +13,7 @@ import numpy as np
 
 from hyrl_mj.errors import BadArtifact, BadInput
 from hyrl_mj.files import archives, artifacts
+from hyrl_mj.policies import pickled
 from hyrl_mj.policies.mlp import MlpPolicy, ObservationPolicy, Policy, SampledPolicy
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 LARGEST_NUMBER = 1e30  # of statistics: its square is a number, too
 NONE = "none"  # in place of a file of statistics: the agent saw plain observations
-RECIPE = "write it with mean, var and clip, as docs/your-agent.md shows"
+RECIPE = "give what env.save() of VecNormalize wrote, or an npz file with mean, var and clip"
 
 
 @dataclass(frozen=True)
@@ -58,15 +59,20 @@ class Normalization:
 
     @staticmethod
     def load(path: Path, parts: Mapping[str, int] = {}, n_stack: int = 1) -> Normalization:
-        """Reads an npz file with the arrays mean, var, clip, and epsilon unless it is SB3's.
+        """Reads what SB3's `VecNormalize.save` writes, of which nothing is unpickled, or an npz file.
 
-        For a Dict with `parts` these may be arrays "mean.KEY" and "var.KEY" for each key, and one clip.
+        That has the arrays mean, var, clip, and epsilon unless it is SB3's. For a Dict with `parts` these may
+        be arrays "mean.KEY" and "var.KEY" for each key, and one clip.
 
         Raises:
             BadArtifact: an array is missing, or has numbers that cannot be.
         """
         with artifacts.reading(path, RECIPE):
-            arrays = archives.read_npz(artifacts.read_limited(path), 2**20)
+            content = artifacts.read_limited(path)
+            if content.startswith(b"\x80"):  # a pickle
+                arrays = pickled.statistics(content)
+            else:
+                arrays = archives.read_npz(content, 2**20)
             if by_key := any(name.startswith(("mean.", "var.")) for name in arrays):
                 arrays = _joined(arrays, parts, n_stack)
             if missing := [name for name in _FIELDS[:3] if name not in arrays]:

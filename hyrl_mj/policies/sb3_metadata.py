@@ -23,7 +23,7 @@ from hyrl_mj.tasks import Task
 # The error of an observation in float32, with room to spare.
 ROUNDING = 1e-3
 HOW = (
-    "give its statistics with --vecnormalize FILE.npz, which docs/your-agent.md shows how to write, or "
+    "give its statistics with --vecnormalize FILE, as env.save() of VecNormalize wrote them, or "
     "--vecnormalize none if it saw plain observations, also for norm_obs=False"
 )
 
