@@ -70,6 +70,7 @@ ALONE = {
     "lost": ({"hold": (2, 0.2), "lost": True}, {"held": 2, "held_rate": 0.2}),
     "quantum": ({"quantum": 0.02}, {"quantum": 0.02}),
 }
+ALTERNATING = np.arange(100) % 2
 NONE = {"bound": 0, "bias": 0, "drift": 0, "delay": 0, "held": 0, "held_rate": 0, "quantum": 0}
 
 
@@ -211,6 +212,16 @@ def test_a_column_that_never_changes_leaves_the_others(tmp_path):
     assert "dead never changes, so its noise cannot be told" in told
     with pytest.raises(BadInput, match="tells no noise: dead never changes"):
         noise_from_log(path, columns=["dead"])
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("values", [1e9 + 1e-9 * ALTERNATING, 1e-300 * ALTERNATING, ALTERNATING])
+def test_numbers_of_any_size_are_taken_at_rest(values, of):
+    log = {"x": np.where(np.arange(100) % 3, values, np.nan)}
+    try:
+        assert of(log, dt=0.05, at_rest=True).text.count("nan") == 0
+    except BadInput as error:
+        assert "never changes" in str(error)
 
 
 # ---- the command, and files of strangers

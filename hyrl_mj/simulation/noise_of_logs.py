@@ -277,7 +277,8 @@ def _noise(
     known = np.isfinite(y)
     if known.sum() < LEAST:
         return ColumnNoise(name, remarks=(f"{name} has fewer than {LEAST} numbers",))
-    if np.ptp(y[known]) == 0:
+    tiny = 1e-9 * float(np.nanmax(np.abs(y)))  # more than the rounding of floats does
+    if np.ptp(y[known]) <= tiny:
         return ColumnNoise(name, remarks=(f"{name} never changes, so its noise cannot be told",))
     remarks = ["without a reference, bias and delay cannot be told"] if r is None else []
     if r is None:
@@ -285,7 +286,6 @@ def _noise(
     else:
         reference = r
         _check_units(name, y, r)
-    tiny = 1e-9 * float(np.nanmax(np.abs(y)))  # more than the rounding of floats does
     last = np.maximum.accumulate(np.where(known, np.arange(len(y)), 0))
     again = ~known | (np.abs(y - np.concatenate([y[:1], y[last[:-1]]])) <= tiny)
     again[: np.argmin(again | (np.arange(len(y)) <= np.argmax(known)))] = False  # before it moves
@@ -325,7 +325,7 @@ def _noise(
         for x in (white, used.astype(float))
     )
     pairs = sums / np.maximum(counts, 1)
-    correlations = pairs / max(pairs[0], tiny**2)
+    correlations = pairs / max(pairs[0], 1e-300)
     middle = sum(np.quantile(slow, ENDS)) / 2
     correlation = float(correlations[1])
     if bound and abs(correlation) > max(0.2, stats.norm.isf(CHANCE) / np.sqrt(used.sum())):
