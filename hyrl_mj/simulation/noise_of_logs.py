@@ -443,6 +443,8 @@ def _delay(
 
 def _quantum(values: np.ndarray, samples: int, tiny: float) -> float:
     """Returns the step of which all differences between values are multiples, 0 if there is none."""
+    if not len(values):
+        return 0.0
     distinct = np.unique(values)
     distinct = distinct[np.concatenate([[True], np.diff(distinct) > tiny])]
     gaps = np.diff(distinct)
