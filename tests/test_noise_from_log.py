@@ -70,6 +70,7 @@ ALONE = {
     "lost": ({"hold": (2, 0.2), "lost": True}, {"held": 2, "held_rate": 0.2}),
     "quantum": ({"quantum": 0.02}, {"quantum": 0.02}),
 }
+ALTERNATING = np.arange(100) % 2
 NONE = {"bound": 0, "bias": 0, "drift": 0, "delay": 0, "held": 0, "held_rate": 0, "quantum": 0}
 
 
@@ -211,6 +212,15 @@ def test_a_column_that_never_changes_leaves_the_others(tmp_path):
     assert "dead never changes, so its noise cannot be told" in told
     with pytest.raises(BadInput, match="tells no noise: dead never changes"):
         noise_from_log(path, columns=["dead"])
+
+
+@pytest.mark.filterwarnings("error")
+def test_numbers_of_any_size_are_taken(of):
+    log = {"x": np.where(np.arange(100) % 3, 1e-300 * ALTERNATING, np.nan)}
+    assert "nan" not in of(log, dt=0.05, at_rest=True).text
+    for tiny in (1e-9 * ALTERNATING, 0.9 * np.arange(100)):  # beside 1e9, the rounding of floats
+        with pytest.raises(BadInput, match="tells no noise"):
+            of({"x": 1e9 + tiny}, dt=0.05, at_rest=True)
 
 
 # ---- the command, and files of strangers

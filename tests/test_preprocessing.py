@@ -281,7 +281,7 @@ def test_a_normalised_agent_is_a_function_of_the_measurement(circle, tmp_path):
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
-        ({"mean": np.zeros(2), "var": np.ones(2)}, "it has no array clip: write it with mean"),
+        ({"mean": np.zeros(2), "var": np.ones(2)}, "it has no array clip: give what env.save"),
         ({}, "it has no array mean and no var and no clip"),
         (
             {"mean": np.zeros(3), "var": np.ones(3), "clip": 10},
@@ -312,7 +312,7 @@ def test_statistics_that_cannot_be_are_refused(arrays, message, circle, tmp_path
 
 def test_what_is_no_file_of_statistics_is_refused(circle, tmp_path):
     _, path, _ = agent(PPO, circle, tmp_path, WRAPPED["normalised"])
-    with pytest.raises(BadArtifact, match=r"there is no file .*none\.npz: write it with mean"):
+    with pytest.raises(BadArtifact, match=r"there is no file .*none\.npz: give what env.save"):
         load_agent(path, circle, vecnormalize=tmp_path / "none.npz")
     (tmp_path / "s.npz").write_bytes(b"not an npz")
     with pytest.raises(BadArtifact, match=r"s\.npz cannot be read"):

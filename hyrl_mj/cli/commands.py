@@ -244,12 +244,14 @@ def noise(
 ) -> None:
     """Find out from a log of measurements which noise to give to a run.
 
-    LOG is a CSV file with a line of names: t or time [s], measured columns, and beside each NAME what is
-    true as NAME_ref. Numbers are in the units of the log. Without --out nothing is written.
+    LOG is a CSV file with t or time [s], measured columns, and their NAME_ref.
+
+    Numbers are in the units of the log. Without --out nothing is written.
 
     Args:
         log: the CSV file.
-        columns: the measured columns to look at; by default all that have a NAME_ref, and at rest all.
+        columns: the measured columns to look at; by default all that have a NAME_ref with what is true, and
+            at rest all.
         dt: the time between two rows [s]; by default from the column t or time.
         at_rest: the robot stood still while the log was written, so no references are needed.
         scale: factors by which columns are multiplied, as x=0.001 x_ref=0.001 for mm; by default 1.

@@ -8,7 +8,6 @@ from math import nan
 from pathlib import Path
 
 import numpy as np
-import scipy
 
 from hyrl_mj.errors import BadInput, counted, unknown
 from hyrl_mj.files.logs import read_log
@@ -273,10 +272,13 @@ def _noise(
     share: float,
 ) -> ColumnNoise:
     """Returns the noise of one column: measurements and references (n,) at times (n,) [s], NaN in gaps."""
+    from scipy import signal, stats  # slow to import
+
     known = np.isfinite(y)
     if known.sum() < LEAST:
         return ColumnNoise(name, remarks=(f"{name} has fewer than {LEAST} numbers",))
-    if np.ptp(y[known]) == 0:
+    tiny = 1e-9 * float(np.nanmax(np.abs(y)))  # more than the rounding of floats does
+    if np.ptp(y[known]) <= tiny:
         return ColumnNoise(name, remarks=(f"{name} never changes, so its noise cannot be told",))
     remarks = ["without a reference, bias and delay cannot be told"] if r is None else []
     if r is None:
@@ -284,7 +286,6 @@ def _noise(
     else:
         reference = r
         _check_units(name, y, r)
-    tiny = 1e-9 * float(np.nanmax(np.abs(y)))  # more than the rounding of floats does
     last = np.maximum.accumulate(np.where(known, np.arange(len(y)), 0))
     again = ~known | (np.abs(y - np.concatenate([y[:1], y[last[:-1]]])) <= tiny)
     again[: np.argmin(again | (np.arange(len(y)) <= np.argmax(known)))] = False  # before it moves
@@ -320,14 +321,14 @@ def _noise(
         remarks += said
     white = np.where(used, left - left[used].mean(), 0.0)
     sums, counts = (
-        scipy.signal.correlate(x, x, method="fft")[len(x) - 1 :][: MOST_LAGS + 1]
+        signal.correlate(x, x, method="fft")[len(x) - 1 :][: MOST_LAGS + 1]
         for x in (white, used.astype(float))
     )
     pairs = sums / np.maximum(counts, 1)
-    correlations = pairs / max(pairs[0], tiny**2)
+    correlations = pairs / max(pairs[0], 1e-300)
     middle = sum(np.quantile(slow, ENDS)) / 2
     correlation = float(correlations[1])
-    if bound and abs(correlation) > max(0.2, scipy.stats.norm.isf(CHANCE) / np.sqrt(used.sum())):
+    if bound and abs(correlation) > max(0.2, stats.norm.isf(CHANCE) / np.sqrt(used.sum())):
         steps = np.abs(np.diff(left))
         fast = np.nanquantile(steps[used[1:] & used[:-1]], 0.95) / dt
         remarks.append(
@@ -361,9 +362,11 @@ def _noise(
 
 def _check_units(name: str, y: np.ndarray, r: np.ndarray) -> None:
     """Raises `BadInput` if a measurement has another unit than its reference."""
+    from scipy import stats
+
     both = np.isfinite(y) & np.isfinite(r)
-    moves = scipy.stats.iqr(r[both]) if both.any() else 0.0
-    ratio = scipy.stats.iqr(y[both]) / moves if moves else 1.0
+    moves = stats.iqr(r[both]) if both.any() else 0.0
+    ratio = stats.iqr(y[both]) / moves if moves else 1.0
     for units, factor in UNITS.items():
         if abs(ratio / factor - 1) < 0.05:
             raise BadInput(
@@ -374,9 +377,11 @@ def _check_units(name: str, y: np.ndarray, r: np.ndarray) -> None:
 
 def _slope(name: str, y: np.ndarray, r: np.ndarray) -> list[str]:
     """Returns a remark if a measurement changes more or less than its reference."""
+    from scipy import stats
+
     if np.ptp(r) == 0:
         return []
-    line = scipy.stats.linregress(r, y)
+    line = stats.linregress(r, y)
     if abs(line.slope - 1) <= max(0.05, 4 * line.stderr):
         return []
     return [
@@ -402,6 +407,8 @@ def _delay(
 
     A line is taken out of each tenth of the error, because drift is no delay.
     """
+    from scipy import signal, stats
+
     most = min(LONGEST_DELAY, len(y) // 8)
     lags = np.arange(-most // 10, most + 1)
     squares = np.full(len(lags), np.inf)
@@ -411,14 +418,14 @@ def _delay(
         if len(error) >= LEAST:
             error = wrapped(error) if turn else error
             parts = np.linspace(0, len(error), 11).astype(int)[1:-1]
-            squares[i] = np.mean(scipy.signal.detrend(error, bp=parts) ** 2)
+            squares[i] = np.mean(signal.detrend(error, bp=parts) ** 2)
     i = int(np.clip(np.argmin(squares), 1, len(lags) - 2))
     beside, best = squares[[i - 1, i + 1]], max(squares[i], 1e-300)
     if not np.isfinite(beside).all():
         return nan, [f"{name} has too few samples with a reference for a delay to be told"]
     # Twice the logarithm of the likelihood ratio of the next best delay.
     sure = fresh.sum() * np.log(max(beside.min(), best) / best)
-    if sure < scipy.stats.chi2.isf(CHANCE, 1):
+    if sure < stats.chi2.isf(CHANCE, 1):
         return nan, [f"{name}_ref moves too little for a delay to be told"]
     if squares[i] > squares.min():
         return nan, [f"{name} may be more than {most} samples late: give a longer log"]
@@ -436,6 +443,8 @@ def _delay(
 
 def _quantum(values: np.ndarray, samples: int, tiny: float) -> float:
     """Returns the step of which all differences between values are multiples, 0 if there is none."""
+    if not len(values):
+        return 0.0
     distinct = np.unique(values)
     distinct = distinct[np.concatenate([[True], np.diff(distinct) > tiny])]
     gaps = np.diff(distinct)
@@ -478,6 +487,8 @@ def _held(again: np.ndarray, moves: np.ndarray, chance: float) -> tuple[int, flo
         moves: (n,) whether one that is not held would seldom be.
         chance: the probability of that.
     """
+    from scipy import stats
+
     row = np.zeros(len(again), dtype=int)
     for k in np.flatnonzero(again & moves):
         row[k] = row[k - 1] + 1
@@ -492,7 +503,7 @@ def _held(again: np.ndarray, moves: np.ndarray, chance: float) -> tuple[int, flo
         ratio = min(max(ratio, 0.0), 1.0)
         # One too many does little harm, but none is none.
         enough = CHANCE if most == 0 else 100 * CHANCE
-        if not longer or scipy.stats.binomtest(longer, base, ratio, "greater").pvalue > enough:
+        if not longer or stats.binomtest(longer, base, ratio, "greater").pvalue > enough:
             return most, rate
         most += 1
         could = moves[1:] & (row[:-1] < most)
@@ -508,12 +519,14 @@ def _drift(error: np.ndarray, dt: float, tiny: float) -> tuple[np.ndarray, float
     White noise leaves the means of blocks uncorrelated; drift is where, for some length of the blocks, more
     than half of their variance goes on in the next one.
     """
+    from scipy import signal, stats
+
     n, known, persists, length = len(error), np.isfinite(error), False, 8
     while n // length >= 16 and not persists:
         means = _means(error, length)
         means -= means.mean()
         correlation = (means[1:] @ means[:-1]) / max(means @ means, 1e-300)
-        enough = scipy.stats.norm.isf(CHANCE) / np.sqrt(len(means))
+        enough = stats.norm.isf(CHANCE) / np.sqrt(len(means))
         persists = bool(correlation > max(0.5, enough))
         length *= 2
     if not persists or np.ptp(error[known]) < tiny:
@@ -527,9 +540,9 @@ def _drift(error: np.ndarray, dt: float, tiny: float) -> tuple[np.ndarray, float
     for window in np.unique((5 * 1.25 ** np.arange(40)).astype(int) // 2 * 2 + 1):
         if window > len(means) // 4:
             break
-        slopes = scipy.signal.savgol_filter(means, window, 1, deriv=1, delta=each)
+        slopes = signal.savgol_filter(means, window, 1, deriv=1, delta=each)
         noise = sigma * np.sqrt(12) / (window**1.5 * each)  # of a slope by least squares
-        rate = np.quantile(np.abs(slopes), 0.95) - scipy.stats.norm.ppf(0.95) * noise
+        rate = np.quantile(np.abs(slopes), 0.95) - stats.norm.ppf(0.95) * noise
         best = min(best, (noise / max(rate, 1e-300), window, rate))
         if best[0] < 0.15:  # the shortest window in which noise does not make the slope
             break
@@ -537,9 +550,9 @@ def _drift(error: np.ndarray, dt: float, tiny: float) -> tuple[np.ndarray, float
     half = max(
         window // 4 * 2 + 1, 5
     )  # corners are cut less where a parabola is fitted to half of it
-    smooth = scipy.signal.savgol_filter(means, half, 2)
+    smooth = signal.savgol_filter(means, half, 2)
     # A parabola is uncertain at its ends: there, a line.
-    line = scipy.signal.savgol_filter(means, half, 1)
+    line = signal.savgol_filter(means, half, 1)
     smooth[: half // 2], smooth[-half // 2 :] = line[: half // 2], line[-half // 2 :]
     centres = (np.arange(len(means)) + 0.5) * length - 0.5
     slow = np.interp(np.arange(n), centres, smooth)
@@ -563,6 +576,8 @@ def _spread(
     left: np.ndarray, quantum: float, share: float, tiny: float, drift: float
 ) -> tuple[float, float, bool]:
     """Returns deviation and bound of noise, without what rounding adds, and whether it is uniform."""
+    from scipy import stats
+
     bound = float(np.quantile(np.abs(left), share))
     kept = np.clip(left, -bound, bound)
     whole, rounding = float(np.mean(kept**2)), quantum**2 / 12
@@ -570,7 +585,7 @@ def _spread(
     if bound <= max(tiny, drift / 20) or whole < 1.1 * rounding:
         return 0.0, 0.0, False
     sigma = float(np.sqrt(whole - rounding))
-    if scipy.stats.kurtosis(kept) > -0.6:  # that of uniform noise is -1.2, of normal noise 0
+    if stats.kurtosis(kept) > -0.6:  # that of uniform noise is -1.2, of normal noise 0
         return sigma, bound * sigma / whole**0.5, False
     # Smoothing and rounding blur the edges of uniform noise, but not its deviation.
     return sigma, min(bound, sigma * 3**0.5) if drift or quantum else bound, True

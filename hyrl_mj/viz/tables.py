@@ -314,15 +314,15 @@ def noise_table(noise: LogNoise) -> Table:
     """Returns the noise of a log: a row for each column; "-" is what the log does not tell."""
 
     def told(value: float, unit: str = "") -> str:
-        return "-" if np.isnan(value) else f"{value:.3g}{unit}"
+        return "-" if np.isnan(value) else f"{value:.2g}{unit}"
 
     rows = []
     for c in noise.columns:
         if not len(c.errors):
             rows.append([c.name, *["-"] * 8])
             continue
-        held = f"{c.held}, {100 * c.held_rate:.1f}%" if c.held else "0"
-        drift = f"{c.drift:.3g}, {c.drift_rate:.3g}/s" if c.drift else "0"
+        held = f"{c.held}, {100 * c.held_rate:.0f}%" if c.held else "0"
+        drift = f"{c.drift:.2g}, {c.drift_rate:.2g}/s" if c.drift else "0"
         row = [c.name, told(c.delay), held, told(c.quantum), told(c.bias), drift]
         rows.append([*row, told(c.bound), told(c.sigma), f"{c.correlation:.2f}"])
     headings = ("", "delay", "held", "quantum", "bias", "drift", "bound", "sigma", "lag 1")
