@@ -1,5 +1,7 @@
 """Agents with a memory that they declare close loops; who remembers anything else is refused by name."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -7,11 +9,11 @@ from planted import sign_policy
 from trapped import HONEST, TRAPS
 
 import hyrl_mj
-from hyrl_mj import BadInput, Noise, from_callable, simulate
+from hyrl_mj import BadArtifact, BadInput, Noise, from_callable, simulate
 from hyrl_mj.envs.core import BatchedEnv
 from hyrl_mj.envs.sb3_env import TaskVecEnv
 from hyrl_mj.judging.game import Answers, Lattice
-from hyrl_mj.policies import PolicyController, memory_at_start
+from hyrl_mj.policies import PolicyController, agent_at, memory_at_start
 from hyrl_mj.policies.external import read_agent
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import LoopSettings, Programmes, Rules, closed_loop
@@ -449,6 +451,30 @@ def test_what_it_lacks_is_said(circle):
         BadInput, match="a function of the measurement, and this policy has a memory"
     ):
         Answers.ask(lattice, loop, np.zeros(1))
+
+
+# ---- from the command line
+
+
+def test_python_code_is_named_by_its_module_and_object(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my_agents.py").write_text(
+        "class Group:\n    @staticmethod\n    def steer(o):\n        return o[:, :1]\n\n\nthree = 3\n"
+    )
+    found = agent_at(Path("my_agents:Group.steer"))
+    assert found(np.ones((2, 3))).tolist() == [[1], [1]]
+    (tmp_path / "my_agents:Group.steer").touch()  # a file comes first
+    assert agent_at(Path("my_agents:Group.steer")) == Path("my_agents:Group.steer")
+    for name, why in (
+        ("my_agents:three", "is of type int"),
+        ("my_agents:four", "cannot be imported .AttributeError"),
+        ("my_agents:", "cannot be imported"),
+        ("no_such_module:agent", "cannot be imported .ModuleNotFoundError"),
+    ):
+        with pytest.raises(BadInput, match=why):
+            agent_at(Path(name))
+    with pytest.raises(BadArtifact, match="no file"):
+        agent_at(Path("agent.zip"))
 
 
 # ---- in a run

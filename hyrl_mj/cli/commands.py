@@ -15,7 +15,7 @@ from hyrl_mj.fields import DriveOptions, exported_controller
 from hyrl_mj.files import trust
 from hyrl_mj.judging import Word
 from hyrl_mj.pipeline import AgentOptions, ExamineOptions, RunOptions, SweepOptions
-from hyrl_mj.policies import check_agent_file
+from hyrl_mj.policies import AnyPolicy, agent_at
 from hyrl_mj.runs.arcs import noisy_arcs
 from hyrl_mj.runs.directory import Run
 from hyrl_mj.simulation import noise_from_log
@@ -79,8 +79,8 @@ def robustify(
 
     Args:
         task: a task, see `hyrl-mj list`, or a Python file that defines one; by default none, with --env.
-        policy: the agent, a .zip that SB3's model.save wrote, an .onnx file, or a .safetensors file; by
-            default none, with --explain.
+        policy: the agent, a .zip that SB3's model.save wrote, an .onnx file, a .safetensors file, or Python
+            code as module:object, which is imported; by default none, with --explain.
     """
     if given := given_agent("robustify", task, policy, environment):
         finish(pipeline.robustify(*given, options))
@@ -88,17 +88,20 @@ def robustify(
 
 def given_agent(
     command: str, task: str | None, policy: Path | None, environment: EnvironmentOptions
-) -> tuple[Task, Path] | None:
+) -> tuple[Task, AnyPolicy] | None:
     """Returns the task and the agent of a command; None if it only explains an environment."""
+    agent = None
     if policy is not None and not environment.explain:
-        check_agent_file(policy)  # said before an environment is tried out, which takes longer
+        agent = agent_at(policy)  # said before an environment is tried out, which takes longer
     chosen = chosen_task(task, environment)
     if environment.explain:
         print(explained(chosen))
         return None
-    if policy is None:
-        raise BadInput(f"{command} needs --policy: the agent, a .zip, .onnx or .safetensors file")
-    return chosen, policy
+    if agent is None:
+        raise BadInput(
+            f"{command} needs --policy: the agent, a .zip, .onnx or .safetensors file, or module:object"
+        )
+    return chosen, agent
 
 
 def finish(run: Run) -> None:
@@ -146,8 +149,8 @@ def diagnose(
 
     Args:
         task: a task, see `hyrl-mj list`, or a Python file that defines one; by default none, with --env.
-        policy: the agent, a .zip that SB3's model.save wrote, an .onnx file, or a .safetensors file; by
-            default none, with --explain.
+        policy: the agent, a .zip that SB3's model.save wrote, an .onnx file, a .safetensors file, or Python
+            code as module:object, which is imported; by default none, with --explain.
     """
     if given := given_agent("diagnose", task, policy, environment):
         pipeline.diagnose(*given, options)

@@ -1,14 +1,16 @@
 """External agents, which `robustify` starts from: how they are read, described and stored."""
 
+import importlib
 from dataclasses import dataclass, field, replace
 from hashlib import sha256
+from operator import attrgetter
 from pathlib import Path
 from typing import cast
 
 import numpy as np
 
-from hyrl_mj.errors import BadArtifact, BadInput, check_seed, unknown
-from hyrl_mj.files import artifacts
+from hyrl_mj.errors import BadArtifact, BadInput, brief, check_seed, unknown
+from hyrl_mj.files import artifacts, trust
 from hyrl_mj.policies import algorithms
 from hyrl_mj.policies.controllers import PolicyController, is_memory, memory_at_start
 from hyrl_mj.policies.functions import PythonAgent, declares_memory, from_callable
@@ -130,10 +132,32 @@ class ExternalAgent:
             normalization.save(path / STATISTICS)
 
 
-def check_agent_file(path: Path) -> None:
-    """Raises BadArtifact if there is no file at the path of an agent."""
-    with artifacts.reading(path, REMEDY):
-        path.stat()
+def agent_at(path: Path) -> AnyPolicy:
+    """Returns the path of an agent's file itself, or the object that `module:object` names.
+
+    A module is imported if there is no such file, from the current folder where it is not installed.
+
+    Raises:
+        BadArtifact: there is no such file.
+        BadInput: there is no such module or object, or it can be no agent.
+    """
+    module, colon, name = str(path).partition(":")
+    if not colon or path.exists():
+        with artifacts.reading(path, REMEDY):
+            path.stat()
+        return path
+    try:
+        with trust.current_folder(module):
+            agent = attrgetter(name)(importlib.import_module(module))
+    except (Exception, SystemExit) as error:  # a foreign module can raise anything
+        raise BadInput(f"the agent {path} cannot be imported: {brief(error)}") from error
+    if not callable(agent) and not callable(getattr(agent, "act", getattr(agent, "predict", None))):
+        raise BadInput(
+            f"the agent {path} is of type {type(agent).__name__}: name a function of observations, or an "
+            "object with the methods start and act, or predict"
+        )
+    found: AnyPolicy = agent
+    return found
 
 
 def load_agent(
