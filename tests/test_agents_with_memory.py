@@ -467,9 +467,9 @@ def test_python_code_is_named_by_its_module_and_object(tmp_path, monkeypatch):
     assert agent_at(Path("my_agents:Group.steer")) == Path("my_agents:Group.steer")
     for name, why in (
         ("my_agents:three", "is of type int"),
-        ("my_agents:four", "cannot be imported .AttributeError"),
+        ("my_agents:four", "cannot be imported: AttributeError"),
         ("my_agents:", "cannot be imported"),
-        ("no_such_module:agent", "cannot be imported .ModuleNotFoundError"),
+        ("no_such_module:agent", "cannot be imported: ModuleNotFoundError"),
     ):
         with pytest.raises(BadInput, match=why):
             agent_at(Path(name))
