@@ -2,10 +2,13 @@
 
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 from planted import sign_policy
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecNormalize
 from trapped import HONEST, TRAPS
 
 import hyrl_mj
@@ -451,6 +454,20 @@ def test_what_it_lacks_is_said(circle):
         BadInput, match="a function of the measurement, and this policy has a memory"
     ):
         Answers.ask(lattice, loop, np.zeros(1))
+
+
+def test_a_model_of_other_observations_or_actions_is_refused(circle):
+    model = PPO("MlpPolicy", TaskVecEnv(BatchedEnv(circle, 1)), n_steps=64)
+    assert from_callable(model, circle).act(np.ones((2, 1))).shape == (2, 1)
+    for task, why in (("gate", r"observes \(2,\), and gate gives \(4,\)"), ("vehicle", "gives")):
+        with pytest.raises(BadInput, match=why):
+            from_callable(model, hyrl_mj.get_task(task))
+    env = VecNormalize(TaskVecEnv(BatchedEnv(circle, 1)))
+    with pytest.raises(BadInput, match="was trained under VecNormalize"):
+        from_callable(PPO("MlpPolicy", env, n_steps=64), circle)
+    model.action_space = gym.spaces.Box(-2, 2, (1,))
+    with pytest.raises(BadInput, match="give a function that scales them"):
+        from_callable(model, circle)
 
 
 # ---- from the command line

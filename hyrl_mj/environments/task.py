@@ -305,6 +305,6 @@ def _again(
     spec: str, noisy: tuple[float, ...], sensor: str, sensor_shares: tuple[float, ...]
 ) -> Task:
     """Returns the task that a text describes, with its noise, in this or another process."""
-    task = get_task(spec).with_sensor(sensor, noisy)
-    task.sensor_shares = sensor_shares
+    task = get_task(spec).with_noise(noisy)
+    task.sensor, task.sensor_shares = sensor, sensor_shares
     return task

@@ -132,17 +132,20 @@ def noisy_episodes(
         raise BadInput(f"{count} episodes cannot be simulated: give at least 1")
     for noise in noises:
         task.check_noise(noise.bound, noise.everywhere)
+    near = max(noise.bound for noise in noises)  # all begin alike
     pairs, firsts = list(product(noises, controllers)), range(0, count, BATCH)
     judged = math.ceil(JUDGED / len(pairs))
     batches = [
-        _Batch(task, regions, controllers[name], noise, seed, first, n, 0 if first else judged)
+        _Batch(
+            task, regions, controllers[name], noise, near, seed, first, n, 0 if first else judged
+        )
         for (noise, name), first in product(pairs, firsts)
         for n in (min(BATCH, count - first),)
     ]
     # The plants are used again: new ones for each batch would fragment the memory.
     plants = {} if cores.given() else {n: task.plant(n) for n in {batch.n for batch in batches}}
     counts: list[EpisodeCount] = []
-    ends: dict[str, dict[str, Ends]] = {}
+    ends: dict[tuple[str, float], dict[str, Ends]] = {}
     with progress_bar(None, "noisy episodes", "episodes", count * len(pairs)) as progress:
         ended = cores.spread(partial(_play, plants), batches)
         for noise, name in pairs:
@@ -151,9 +154,12 @@ def noisy_episodes(
                 played.append(batch)
                 progress.update(min(BATCH, count - first))
             counts += _count(noise, name, played)
-            ends.setdefault(noise.kind, {})[name] = _joined([batch.ends for batch in played])
-    quiet = ends.pop(NO_NOISE, None)
-    comparisons = [compare(kind, quiet, own) for kind, own in ends.items()] if quiet else []
+            ends.setdefault((noise.kind, noise.bound), {})[name] = _joined(
+                [batch.ends for batch in played]
+            )
+    quiet = next((own for (kind, _), own in ends.items() if kind == NO_NOISE), None)
+    noisy = [(kind, own) for (kind, _), own in ends.items() if kind != NO_NOISE]
+    comparisons = [compare(kind, quiet, own) for kind, own in noisy] if quiet else []
     return NoisyEpisodes(tuple(counts), tuple(comparisons))
 
 
@@ -167,13 +173,14 @@ def ends_of(task: Task, run: Rollout) -> Ends:
 class _Batch:
     """Episodes that are simulated at once: the next `n` after the `first` of one noise and controller.
 
-    `judged` of them are played once more by plain MuJoCo.
+    What lies near M* is told by the bound `near`; `judged` of them are played once more by plain MuJoCo.
     """
 
     task: Task
     regions: Regions
     controller: Controller
     noise: NamedNoise
+    near: float
     seed: int
     first: int
     n: int
@@ -193,7 +200,7 @@ def _play(plants: Mapping[int, Plant], batch: _Batch) -> _Played:
     """Plays a batch of episodes."""
     task, noise, regions, n = batch.task, batch.noise, batch.regions, batch.n
     seeds = np.random.SeedSequence([batch.seed, batch.first]).generate_state(2)
-    z0 = regions.draw(task, noise.bound, n, np.random.default_rng(seeds[0]))
+    z0 = regions.draw(task, batch.near, n, np.random.default_rng(seeds[0]))
     plant = plants.get(n) or task.plant(n)
     judged = batch.judged
     settings = LoopSettings(vary=True, plant=plant, quiet=True, record=judged > 0, states=False)
@@ -206,7 +213,7 @@ def _play(plants: Mapping[int, Plant], batch: _Batch) -> _Played:
         else:  # every loss of an environment is played again
             rows = lost_first[: max(judged, int((runs.outcome != Outcome.REACHED).sum()))]
             task.verify(z0, runs, rows)
-    return _Played(ends_of(task, runs), runs.outcome, regions.split(task, noise.bound, z0))
+    return _Played(ends_of(task, runs), runs.outcome, regions.split(task, batch.near, z0))
 
 
 def _joined(parts: Sequence[Ends]) -> Ends:

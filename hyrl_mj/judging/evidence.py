@@ -111,10 +111,13 @@ class SuccessRates:
 
 
 def by_kind(robustness: Robustness, who: str) -> dict[str, tuple[int, int]]:
-    """Returns how many of a controller's episodes arrive, and of how many, by kind of noise."""
+    """Returns how many of a controller's episodes arrive, and of how many, by kind of noise.
+
+    Sums of parts and logs, whose texts have several words, have other bounds than the examination.
+    """
     counts: dict[str, tuple[int, int]] = {}
     for count in robustness.episodes:
-        if count.controller == who:
+        if count.controller == who and " " not in count.noise:
             arrived, episodes = counts.get(count.noise, (0, 0))
             counts[count.noise] = arrived + count.episodes - count.lost, episodes + count.episodes
     return counts

@@ -16,10 +16,8 @@ from hyrl_mj.judging.worst_case import worst_case
 from hyrl_mj.policies import Controller
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.simulation import (
-    SENSOR,
     AttackSettings,
     HybridArc,
-    covers_sensor,
     noise_of,
     usual_kinds,
 )
@@ -148,10 +146,7 @@ def examine(
         count = subject.effort.episodes
     if count is not None and count < 1:
         raise BadInput(f"{count} episodes cannot be simulated: give at least 1")
-    kinds = options.noise or usual_kinds(task)
-    if not options.noise and not covers_sensor(task, eps):
-        kinds = tuple(kind for kind in kinds if kind != SENSOR)
-    noises = [noise_of(kind, eps, everywhere) for kind in kinds]
+    noises = [noise_of(kind, eps, everywhere) for kind in options.noise or usual_kinds(task, eps)]
     game, maps = None, None
     if subject.playable:
         bounds = tuple(dict.fromkeys((0.0, eps / 2, eps)))

@@ -275,7 +275,7 @@ class _Case:
         counts, s = by_kind(self.robustness, "hyrl"), self.settings
         samples = [
             Sample(kind, *counts.get(kind, (0, 0)), False, s.episodes)
-            for kind in dict.fromkeys((*usual_kinds(self.task), *counts))
+            for kind in dict.fromkeys((*usual_kinds(self.task, self.robustness.eps), *counts))
         ]
         attacks = [c for c in self.robustness.attacks if c.controller == "hyrl"]
         won, total = next(((c.attacked - c.lost, c.attacked) for c in attacks), (0, 0))
@@ -354,7 +354,8 @@ class _Case:
     def reasons(self) -> Iterator[str]:
         """Yields the results behind the verdict."""
         if covers_sensor(self.task, self.robustness.eps):
-            yield f"what the sensors do is within that bound: {self.task.sensor}"
+            where = listed(self.task.chart.names)
+            yield f"what the sensors do to {where} is within that bound: {self.task.sensor}"
         yield from self._shares() if self.robustness.deciding else self._counts()
         yield from map(comparison_sentence, self.robustness.comparisons)
         yield f"stage 1: the policy {self.arrivals}"

@@ -18,12 +18,13 @@ OPTIONS = {
     "preset": "--preset",
     "seed": "--seed, in a sweep --seeds",
     "noise": "--eps",
+    "sensor": "--noise",
     "horizon": "--horizon",
     "everywhere": "--all-coordinates",
     "stage1.algorithm": "--algorithm",
 }
 # Names of options that differ from those of their settings.
-NAMES = {"noise": "eps", "stage1": "policy", "everywhere": "all_coordinates"}
+NAMES = {"noise": "eps", "sensor": "noise", "stage1": "policy", "everywhere": "all_coordinates"}
 
 
 def changed(settings: Settings, changes: Mapping[str, object]) -> Settings:

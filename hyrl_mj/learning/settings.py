@@ -135,8 +135,6 @@ class Settings:
         search: search method for critical points, "rods" or "outcome".
         everywhere: whether the noise acts on all coordinates, not only on the task's noisy ones.
         sensor: what the sensors do that the noise covers; None if they add noise of its bound alone.
-        shares: (p,) of the noise on the columns of the measurement, where a sensor needs others than the
-            task's.
         ways: how ways are told apart (stages 2 and 3).
         overlap: how far the parts are extended (stages 4 and 5).
         modes: where the policies of modes are trained, and when they are good enough (stage 6).
@@ -159,7 +157,6 @@ class Settings:
     search: Annotated[str, OneOf(SEARCHES)] = "rods"
     everywhere: Annotated[bool, Flag()] = False
     sensor: Annotated[str | None, Optional(Text())] = None
-    shares: Annotated[tuple[float, ...], Several(Number(0, 1e6), 0, 1_000)] = ()
     ways: Annotated[WaySettings, Instance((WaySettings,))] = WaySettings()
     overlap: Annotated[OverlapSettings, Instance((OverlapSettings,))] = OverlapSettings()
     modes: Annotated[ModeSettings, Instance((ModeSettings,))] = ModeSettings()
@@ -181,16 +178,16 @@ class Settings:
         """Returns a task with the noise of these settings.
 
         Raises:
-            BadInput: its measurement has another number of columns than the settings are for.
+            BadInput: the bound does not cover what the sensor does.
         """
         if self.sensor is not None:
-            if len(self.shares) != len(task.noisy):
+            bound, shares = Sensor.parse(self.sensor).on(task)
+            if bound != self.noise:
                 raise BadInput(
-                    f"shares {self.shares} cannot be used: give {len(task.noisy)}, one for each column of "
-                    f"the measurement of {task.name}"
+                    f"the sensor {self.sensor} needs a noise bound of {bound:g} on {task.name}, and not "
+                    f"{self.noise:g}: start a new run"
                 )
-            Sensor.parse(self.sensor)
-            return task.with_sensor(self.sensor, self.shares)
+            return task.with_sensor(self.sensor, shares)
         return task.noisy_everywhere() if self.everywhere else task
 
     def check(self, task: Task) -> None:

@@ -247,7 +247,10 @@ def _settings(task: Task, options: RunOptions | AgentOptions, **changes: Any) ->
     """Returns the settings of the preset that options name."""
     eps, seed, horizon = options.eps, options.seed, options.horizon
     sensor = options.noise
-    shares: tuple[float, ...] = ()
+    if task.sensor and not isinstance(task.sensor, str):
+        raise BadInput(f"sensor of {task.name} is {task.sensor!r:.60}: give a text, as 'bias 0.1'")
+    if task.sensor:  # what is wrong with it is said now
+        Sensor.parse(task.sensor)
     if sensor is None and eps is None:
         sensor = task.sensor or None
     if sensor is not None:
@@ -260,7 +263,7 @@ def _settings(task: Task, options: RunOptions | AgentOptions, **changes: Any) ->
     eps = BOUND if eps is None else eps
     settings = preset(task, options.preset, noise=eps, seed=seed, horizon=horizon, **changes)
     everywhere = options.all_coordinates
-    settings = replace(settings, everywhere=everywhere, sensor=sensor, shares=shares)
+    settings = replace(settings, everywhere=everywhere, sensor=sensor)
     if options.set:
         settings = changed(settings, options.set)
     settings.check(task)

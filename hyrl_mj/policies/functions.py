@@ -203,6 +203,7 @@ class _Predicting:
 
 def _predicting(model: Predicts, task: Task) -> FunctionPolicy | RememberingPolicy:
     """Returns a model with SB3's `predict` as a policy, which has a memory if the model has a state."""
+    _check_model(model, task)
     observation = np.zeros((1, len(task.observation_low)), dtype=np.float32)
     begins = np.ones(1, dtype=bool)
     try:
@@ -218,6 +219,34 @@ def _predicting(model: Predicts, task: Task) -> FunctionPolicy | RememberingPoli
             "(layers, n, size), or an object with start(n) and act(memory, observation)"
         )
     return RememberingPolicy(task, _Predicting(model, state), "the model")
+
+
+def _check_model(model: Any, task: Task) -> None:
+    """Raises `BadInput` if an SB3 model was trained on other observations or inputs than those of a task."""
+    normalizer = getattr(model, "get_vec_normalize_env", lambda: None)()
+    if normalizer is not None and normalizer.norm_obs:
+        raise BadInput(
+            "the model was trained under VecNormalize, and would be asked about plain observations: give its "
+            "zip with vecnormalize=, or a function that normalises as its training did"
+        )
+    observations = getattr(getattr(model, "observation_space", None), "shape", None)
+    size = len(task.observation_low)
+    if observations and observations != (size,):
+        raise BadInput(
+            f"the model observes {observations}, and {task.name} gives ({size},): train it on that, or give "
+            "a function that makes its observations"
+        )
+    space: Any = getattr(model, "action_space", None)
+    levels = task.input_levels
+    if levels is not None and getattr(space, "n", len(levels)) != len(levels):
+        raise BadInput(f"the model has {space.n} actions, and {task.name} {len(levels)} levels")
+    if levels is None and hasattr(space, "low"):
+        given, own = np.stack([space.low, space.high]), np.stack(task.input_limits)
+        if given.shape != own.shape or not np.allclose(given, own):
+            raise BadInput(
+                f"the model's actions lie between {space.low} and {space.high}, and inputs of {task.name} "
+                f"between {own[0]} and {own[1]}: give a function that scales them"
+            )
 
 
 def declares_memory(agent: object) -> bool:

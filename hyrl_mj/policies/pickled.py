@@ -18,6 +18,8 @@ from typing import Any
 
 import numpy as np
 
+from hyrl_mj.errors import BadArtifact
+
 # Limit on the pickled text around the numbers [bytes]: a network of ten layers takes a few kilobytes.
 LARGEST = 2**19
 LONGEST = 200  # characters of the name of a function
@@ -168,14 +170,19 @@ def statistics(content: bytes) -> dict[str, np.ndarray]:
     These are mean, var, clip and epsilon; of a Dict mean.KEY and var.KEY for each key.
 
     Raises:
-        ValueError: it is none, or did not normalise observations.
+        BadArtifact: it is none, or did not normalise observations.
     """
+    if len(content) > LARGEST:
+        raise BadArtifact(
+            f"it has {len(content):,} bytes, and statistics take less than {LARGEST:,}: give those of vectors"
+        )
     found = {}
-    if len(content) <= LARGEST:
-        with suppress(Exception):  # a damaged pickle may raise any error
-            found = entries(read(content))
+    with suppress(Exception):  # a damaged pickle may raise any error
+        found = entries(read(content))
     if found.get("norm_obs") is False:
-        raise ValueError("its VecNormalize did not normalise observations: give none in its place")
+        raise BadArtifact(
+            "its VecNormalize did not normalise observations: give none in place of the file"
+        )
     sums = found.get("obs_rms")
     whole = {"": sums} if "mean" in entries(sums) else entries(sums)
     named = {
@@ -188,7 +195,7 @@ def statistics(content: bytes) -> dict[str, np.ndarray]:
         n: np.array(x) if isinstance(x, int | float) else _array(x) for n, x in numbers.items()
     }
     if not named or any(value is None for value in (*named.values(), *values.values())):
-        raise ValueError("it is no VecNormalize that SB3 has saved")
+        raise BadArtifact("it is no VecNormalize that SB3 has saved: give what its save() wrote")
     return {name: value for name, value in {**named, **values}.items() if value is not None}
 
 

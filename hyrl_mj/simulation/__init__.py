@@ -25,7 +25,6 @@ from hyrl_mj.simulation.noise import (
     noise_kinds,
     register_noise,
     signal_for,
-    usual_kinds,
 )
 from hyrl_mj.simulation.noise_of_logs import ColumnNoise, LogNoise, noise_from_log
 from hyrl_mj.simulation.passing import Passing, windings
@@ -33,7 +32,7 @@ from hyrl_mj.simulation.programmes import GIVEN, Programmes
 from hyrl_mj.simulation.real import judge, judge_task
 from hyrl_mj.simulation.rollout import LoopSettings, Rollout, closed_loop
 from hyrl_mj.simulation.rules import Rule, Rules
-from hyrl_mj.simulation.sensors import Sensor, covers_sensor
+from hyrl_mj.simulation.sensors import Sensor, covers_sensor, usual_kinds
 from hyrl_mj.simulation.way_runs import WayRuns, policy_runs, way_runs
 
 __all__ = [

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from hyrl_mj.errors import BadInput, check_seed, counted
 from hyrl_mj.files.artifacts import Saved
 from hyrl_mj.policies import Controller, Policy, PolicyController, as_controller, check_modes
-from hyrl_mj.simulation.noise import AnyNoise, Noise
+from hyrl_mj.simulation.noise import AnyNoise, Noise, signal_for
 from hyrl_mj.simulation.real import judge_beginning
 from hyrl_mj.simulation.rollout import LoopSettings, Rollout, closed_loop
 from hyrl_mj.tasks import Outcome, Task, get_task, task_names
@@ -225,6 +225,7 @@ def simulate_batch(
             raise BadInput(f"{n} starts need one q0 or {n}, got shape {q0.shape}")
         q0 = check_modes(np.broadcast_to(q0, n), loop.modes)
     noise = Noise() if noise is None else noise
+    bound = signal_for(noise, task, loop).bound  # of a sensor with all that it does
     steps = None if horizon is None else samples(task, horizon)
     settings = LoopSettings(steps=steps, record=True)
     rollout = closed_loop(task, loop, starts, noise, q0, seed, settings)
@@ -232,7 +233,7 @@ def simulate_batch(
     if task.source is not None and type(task).plant is Task.plant:
         judge_beginning(task, rollout, task.state(starts), np.arange(min(n, 4)))
     name = "policy" if isinstance(loop, PolicyController) else "hyrl"
-    return [_arc(task, name, rollout, i, noise) for i in range(n)]
+    return [_arc(task, name, rollout, i, noise.kind, bound) for i in range(n)]
 
 
 def samples(task: Task, horizon: float) -> int:
@@ -247,7 +248,7 @@ def samples(task: Task, horizon: float) -> int:
     return max(round(horizon / task.dt), 1)
 
 
-def _arc(task: Task, name: str, rollout: Rollout, i: int, noise: AnyNoise) -> HybridArc:
+def _arc(task: Task, name: str, rollout: Rollout, i: int, noise: str, bound: float) -> HybridArc:
     end = rollout.length[i]
     before, after = rollout.before[:end, i], rollout.q[:end, i]
     jumped = before != after
@@ -273,6 +274,6 @@ def _arc(task: Task, name: str, rollout: Rollout, i: int, noise: AnyNoise) -> Hy
         u=u,
         state=rollout.state[rows, i],
         outcome=Outcome(rollout.outcome[i]).label,
-        noise=noise.kind,
-        bound=noise.bound,
+        noise=noise,
+        bound=bound,
     )

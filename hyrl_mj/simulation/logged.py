@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
@@ -27,10 +28,11 @@ class Logged:
 
     Attributes:
         log: what `noise_from_log` returns.
+        kind: what runs under it are called.
     """
 
     log: LogNoise
-    kind: ClassVar[str] = "log"
+    kind: str = "log"
     everywhere: ClassVar[bool] = False
 
     @property
@@ -57,7 +59,7 @@ class Logged:
 class _Windows(Signal):
     """Windows of the errors of some columns of the measurement, each given with its number."""
 
-    kind = Logged.kind
+    kind = "log"
     unseeing = True
 
     def __init__(self, task: Task, columns: list[tuple[int, ColumnNoise]], bound: float):
@@ -68,6 +70,8 @@ class _Windows(Signal):
         self._columns, self._dt = columns, task.dt
         self._first = max(column.times[0] for _, column in columns)
         self._time = min(column.times[-1] for _, column in columns) - self._first
+        if self._time <= 0:
+            raise BadInput("the columns of the log have no time in common: give them the same rows")
 
     def against(self, task: Task, controller: Controller | None) -> Self:
         return copy(self)
@@ -104,5 +108,6 @@ def noise_of(text: str, bound: float, everywhere: bool = False) -> NamedNoise:
     """
     word, _, rest = text.strip().partition(" ")
     if word == Logged.kind and rest:
-        return Logged(noise_from_log(rest.strip()))
+        path = Path(rest.strip())
+        return Logged(noise_from_log(path), f"{word} {path.name}")
     return Sensor.parse(text) if rest else Noise(text, bound, everywhere)

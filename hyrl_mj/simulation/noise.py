@@ -138,15 +138,6 @@ def noise_kinds() -> tuple[str, ...]:
     return tuple(_KINDS)
 
 
-def usual_kinds(task: Task) -> tuple[str, ...]:
-    """Returns the kinds of noise by which controllers of a task are judged.
-
-    Where samples take long, an adversary that looks ahead takes too long; an attack is there.
-    """
-    kinds = KINDS if task.effort.looks_ahead else KINDS[:-1]
-    return (*kinds, SENSOR) if task.sensor else kinds
-
-
 @register_noise
 class NoNoise(Signal):
     """Exact measurements."""

@@ -15,6 +15,7 @@ from hyrl_mj.tasks import wrapped
 
 TIMES = ("t", "time")
 LONGEST_DELAY = 100  # [samples]: later than that no controller can act upon
+MOST = 20_000_000  # samples with gaps between them, which take 160 MB a column and step
 LEAST = 50  # samples: fewer do not tell noise from motion
 # With which a test finds what is not there: once in 10,000 columns.
 CHANCE = 1e-4
@@ -39,6 +40,7 @@ class ColumnNoise:
         held_rate: the probability with which one is.
         quantum: the step to which it is rounded.
         bias: the constant error.
+        told_bias: its magnitude, 0 if it lies within the error of its estimate.
         drift: largest magnitude of the slow error beside the bias.
         drift_rate: how fast this changes, in the unit each second.
         bound: what a share of what is left of the error keeps.
@@ -58,6 +60,7 @@ class ColumnNoise:
     held_rate: float = 0.0
     quantum: float = 0.0
     bias: float = nan
+    told_bias: float = 0.0
     drift: float = 0.0
     drift_rate: float = 0.0
     bound: float = 0.0
@@ -73,20 +76,17 @@ class ColumnNoise:
     @property
     def text(self) -> str:
         """The noise to give to a run, as "uniform 0.05 + bias 0.02"; "none" if there is none."""
-        # A bias within the error of its estimate is none.
-        least = max(
-            3 * self.sigma / np.sqrt(max(len(self.errors), 1)), self.drift / 20, self.quantum / 20
-        )
         parts = []
         if self.bound and self.uniform:
             parts.append(f"uniform {self.bound:.3g}")
         elif self.bound:
             usual = abs(3 * self.sigma - self.bound) < 0.1 * self.bound
             parts.append(f"gaussian {self.bound:.3g}" + f" sigma {self.sigma:.3g}" * (not usual))
-        if abs(self.bias) > least:
-            parts.append(f"bias {abs(self.bias):.3g}")
+        if self.told_bias:
+            parts.append(f"bias {self.told_bias:.3g}")
         if self.drift:
-            parts.append(f"drift {self.drift:.3g} rate {self.drift_rate:.3g}")
+            rate = f" rate {self.drift_rate:.3g}" * bool(self.drift_rate)
+            parts.append(f"drift {self.drift:.3g}{rate}")
         if self.delay >= 1:
             parts.append(f"delay {self.delay:.0f}")
         if self.held:
@@ -124,6 +124,7 @@ class LogNoise:
             held_rate=most("held_rate"),
             quantum=most("quantum"),
             bias=most("bias"),
+            told_bias=most("told_bias"),
             drift=most("drift"),
             drift_rate=most("drift_rate"),
             bound=most("bound"),
@@ -187,6 +188,10 @@ def noise_from_log(
     if rows < LEAST:
         raise BadInput(f"{path} has {counted(rows, 'row')} of samples: give at least {LEAST}")
     times, place, step, remarks = _clock(path, data[clock[0]] if clock else None, rows, dt)
+    if place[-1] > MOST:
+        raise BadInput(
+            f"{path} has so many gaps in time that it takes {place[-1]:,} samples: give at most {MOST:,}"
+        )
     if rows * (1 - share) < 1 and share < 1:
         remarks.append(
             f"a bound that {share:g} of the samples keep needs {1 / (1 - share):,.0f} rows, and the log has "
@@ -339,24 +344,26 @@ def _noise(
         remarks.append(f"the drift of {name} is too small in its noise for its rate to be sure")
     if (over := np.abs(left[used]).max()) > 2 * (bound + quantum / 2 + drift / 20) + tiny:
         remarks.append(f"some samples of {name} are beyond the bound, the farthest by {over:.3g}")
+    unsure_bias = max(3 * sigma / np.sqrt(used.sum()), drift / 20, quantum / 20)
     return ColumnNoise(
         name,
-        delay if r is not None else nan,
-        held,
-        held_rate,
-        quantum if quantum > sigma / 100 else 0.0,  # a smaller one changes nothing
-        nan if r is None else float(middle),
-        drift,
-        rate,
-        bound,
-        sigma,
-        uniform,
-        correlation,
-        tuple(remarks),
-        t[used],
-        raw[used],
-        slow[used],
-        correlations,
+        delay=delay if r is not None else nan,
+        held=held,
+        held_rate=held_rate,
+        quantum=quantum if quantum > sigma / 100 else 0.0,  # a smaller one changes nothing
+        bias=nan if r is None else float(middle),
+        told_bias=abs(float(middle)) if r is not None and abs(middle) > unsure_bias else 0.0,
+        drift=drift,
+        drift_rate=rate,
+        bound=bound,
+        sigma=sigma,
+        uniform=uniform,
+        correlation=correlation,
+        remarks=tuple(remarks),
+        times=t[used],
+        errors=raw[used],
+        slow=slow[used],
+        correlations=correlations,
     )
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from copy import copy
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar, Self
 
@@ -18,7 +17,9 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from hyrl_mj.errors import BadInput, check_bound, unknown
+from hyrl_mj.simulation.checked_noise import drawn, limits_of
 from hyrl_mj.simulation.noise import (
+    KINDS,
     SENSOR,
     Sample,
     Signal,
@@ -26,6 +27,7 @@ from hyrl_mj.simulation.noise import (
     noise_kinds,
     register_noise,
 )
+from hyrl_mj.tasks import Outcome
 
 if TYPE_CHECKING:
     from hyrl_mj.policies import Controller
@@ -33,8 +35,8 @@ if TYPE_CHECKING:
 
 # The words of parts that are not noise which is added to a sample.
 DELAY, HOLD, QUANTUM = "delay", "hold", "quantum"
-# Bounds are rounded to so many decimals, and sums of floats may exceed them by as much.
-DECIMALS = 9
+# Bounds are rounded up to parts of so many, but for the rounding of sums of floats, which is far below that.
+DECIMALS, ROUNDING = 1e9, 1e-3
 
 
 @register_noise
@@ -51,6 +53,7 @@ class Gaussian(Signal):
 
     def sample(self, now: Sample) -> np.ndarray:
         sigma = self.bound / 3 if self.sigma is None else self.sigma
+        sigma = min(sigma, 1e3 * self.bound)  # from there on it is uniform, to seven digits
         if not self.bound:
             return np.zeros_like(now.measurement)
         share = self.rng.uniform(
@@ -149,7 +152,11 @@ class Part:
             raise BadInput(
                 f"{text.strip()!r} is no part of a sensor: hyrl-mj noise LOG.csv tells which parts it has"
             )
-        words = [kind for kind in noise_kinds() if kind not in ("none", SENSOR)]
+        words = [
+            kind
+            for kind in noise_kinds()
+            if kind not in ("none", SENSOR) and not noise_class(kind).needs_controller
+        ]
         if word not in (words := [*words, DELAY, HOLD, QUANTUM]):
             raise unknown("part of a sensor", word, words)
         allowed = ["rate"] if word == HOLD else []
@@ -168,8 +175,8 @@ class Part:
         try:
             value = float(first)
             options |= {name: float(x) for name, x in zip(names, values, strict=True)}
-        except ValueError:
-            raise BadInput(f"{said}: its numbers are no numbers, write {what}") from None
+        except ValueError as error:
+            raise BadInput(f"{said} ({error}): write {what}") from None
         return Part(word, value, options)._checked()
 
     def _checked(self) -> Part:
@@ -193,8 +200,8 @@ class Sensor:
 
     Each sample is what is true, plus noise of each kind, rounded to the quantum. It arrives after the delay;
     one that is lost is replaced by the last that arrived. A robot was at rest before the start. Noise, bias
-    and drift act on the noisy columns of the measurement by their shares, as for `Noise`; a delayed or held
-    sample has all columns of its time.
+    and drift act on the noisy columns of the measurement by their shares, as for `Noise`; a late or held
+    sample is late in all columns.
 
     Attributes:
         parts: the parts.
@@ -215,7 +222,7 @@ class Sensor:
         Raises:
             BadInput: it describes none.
         """
-        parts = tuple(Part.parse(part) for part in text.split("+"))
+        parts = tuple(Part.parse(part) for part in re.split(r"\+(?!\d)", text))  # not that of 1e+3
         for word in (DELAY, HOLD, QUANTUM):
             if sum(part.word == word for part in parts) > 1:
                 raise BadInput(f"{text!r} has more than one {word}: give one")
@@ -232,15 +239,17 @@ class Sensor:
     @property
     def bound(self) -> float:
         """The largest magnitude of what is added to a sample, in the unit of the measurement."""
-        return sum(part.value for part in self.parts if part.is_noise) + self._of(QUANTUM) / 2
+        noises = (part.value for part in self.parts if part.is_noise)
+        return sum(noises) + self.part(QUANTUM).value / 2
 
     @property
     def late(self) -> int:
         """How many samples old a measurement can be."""
-        return int(self._of(DELAY) + self._of(HOLD))
+        return int(self.part(DELAY).value + self.part(HOLD).value)
 
-    def _of(self, word: str) -> float:
-        return next((part.value for part in self.parts if part.word == word), 0.0)
+    def part(self, word: str) -> Part:
+        """Returns the part of a word, or one that does nothing."""
+        return next((part for part in self.parts if part.word == word), Part(word, 0.0))
 
     def reach(self, task: Task) -> np.ndarray:
         """Returns how far off each column of a measurement can be: (p,), in its unit.
@@ -248,12 +257,13 @@ class Sensor:
         That is the bound of what is added, and what the robot moves meanwhile; see `Task.moves`.
         """
         added = self.bound * np.abs(self._shares(task))
-        return np.round(added + self.late * task.moves if self.late else added, DECIMALS)
+        reach = added + self.late * task.moves if self.late else added
+        return np.abs(np.ceil(reach * DECIMALS - ROUNDING)) / DECIMALS  # where it is 0 not -0
 
     def on(self, task: Task) -> tuple[float, tuple[float, ...]]:
         """Returns the noise bound, and its shares (p,), that cover all that it can do to a chart point.
 
-        Columns of the measurement beside the chart get the noise that is added to them.
+        Columns of the measurement beside the chart get the noise that is added to them, and may be late.
 
         Raises:
             BadInput: the sensor cannot be used with the task, or its noise hides the whole chart.
@@ -274,19 +284,17 @@ class Sensor:
         Raises:
             BadInput: a part cannot be used there.
         """
-        if self.late and task.abilities.side_by_side is not None:
+        if task.abilities.side_by_side is not None and (self.late or self.part(QUANTUM).value):
             raise BadInput(
                 f"{task.name} is an environment, which observes by itself: put Gymnasium's "
-                "DelayObservation around it for a delay, and leave delay and hold out of the sensor"
+                "DelayObservation around it for a delay, and leave delay, hold and quantum out"
             )
         if self.late >= task.max_steps:
             raise BadInput(
                 f"the sensor {self} can be {self.late} samples late, and an episode of {task.name} has "
                 f"{task.max_steps}: give fewer"
             )
-        signal = Sensed(self.bound, self._shares(task))
-        signal.begin(self, task, controller)
-        return signal
+        return Sensed(self.bound, self._shares(task)).begin(self, task, controller)
 
     def _shares(self, task: Task) -> np.ndarray:
         return np.array(task.sensor_shares or task.noisy, dtype=float)
@@ -300,8 +308,11 @@ class Sensed(Signal):
     """
 
     kind = SENSOR
+    sensor: Sensor | None = None
 
-    def against(self, task: Task, controller: Controller | None) -> Self:
+    def against(self, task: Task, controller: Controller | None) -> Signal:  # type: ignore[override]
+        if self.sensor is not None:
+            return self.sensor.against(task, controller)
         if not task.sensor:
             raise BadInput(
                 f"{task.name} has no sensor of its own: make its run with --noise, as --noise 'uniform 0.05 "
@@ -312,14 +323,12 @@ class Sensed(Signal):
                 f"the sensor of {task.name} ({task.sensor}) reaches beyond a bound of {self.bound:g}: leave "
                 "the bound out"
             )
-        signal = copy(self)
-        signal.begin(Sensor.parse(task.sensor), task, controller)
-        return signal
+        return Sensor.parse(task.sensor).against(task, controller)
 
-    def begin(self, sensor: Sensor, task: Task, controller: Controller | None) -> None:
-        """Gets ready for one closed loop."""
-        shares, self._reach = sensor._shares(task), sensor.reach(task)
-        self.bound, self.shares = float(self._reach.max()), shares
+    def begin(self, sensor: Sensor, task: Task, controller: Controller | None) -> Self:
+        """Gets ready for one closed loop of a task, and returns itself."""
+        shares, self._reach = self.shares, sensor.reach(task)
+        self.bound = float(self._reach[: task.chart.dimension].max())
         self.sensor, self.task = sensor, task
         self.noises: list[Signal] = []
         for part in sensor.parts:
@@ -327,17 +336,21 @@ class Sensed(Signal):
                 noise = noise_class(part.word)(part.value, shares.copy())
                 vars(noise).update(part.options)
                 self.noises.append(noise.against(task, controller))
-        self._quantum = sensor._of(QUANTUM) * np.abs(shares)
-        parts = {part.word: part for part in sensor.parts}
-        delay, hold = (parts.get(word, Part(word, 0.0)) for word in (DELAY, HOLD))
+                if not np.array_equal(limits_of(noise), part.value * np.abs(shares)):
+                    raise BadInput(
+                        f"{part.word} noise has other bounds than are given: leave them as they are"
+                    )
+        self._quantum = sensor.part(QUANTUM).value * np.abs(shares)
+        delay, hold = sensor.part(DELAY), sensor.part(HOLD)
         self._delays = int(delay.options.get("least", delay.value)), int(delay.value)
         self._most, self._rate = int(hold.value), hold.options.get("rate", 0.5)
-        alone = not (sensor.late or self._quantum.any())
-        self.unseeing = alone and all(noise.unseeing for noise in self.noises)
+        self._late, added = sensor.late, not (sensor.late or self._quantum.any())
+        self.unseeing = added and all(noise.unseeing for noise in self.noises)
+        return self
 
     @property
     def limits(self) -> np.ndarray:
-        return np.asarray(self._reach + (self._reach > 0) * 10.0**-DECIMALS)
+        return np.asarray(self._reach + (self._reach > 0) / DECIMALS)
 
     def reset(self, n: int, rng: np.random.Generator) -> None:
         super().reset(n, rng)
@@ -345,19 +358,18 @@ class Sensed(Signal):
             noise.reset(n, rng)
         columns = len(self.shares)
         self._sent = np.zeros((n, 1 + self._delays[1], columns))  # the last one last
-        self._told, self._row, self._delay = (
-            np.zeros((n, columns)),
-            np.zeros(n, int),
-            np.zeros(n, int),
-        )
+        self._told, self._row = np.zeros((n, columns)), np.zeros(n, int)
+        self._delay = np.zeros(n, int)
 
     def sample(self, now: Sample) -> np.ndarray:
         true, rows, fresh = now.measurement, now.rows, now.k == 0
-        seen = true + sum((noise.sample(now) for noise in self.noises), np.zeros_like(true))
+        added = sum((drawn(noise, now) for noise in self.noises), np.zeros_like(true))
+        seen = true + added
         if (some := self._quantum > 0).any():
             seen[:, some] = np.round(seen[:, some] / self._quantum[some]) * self._quantum[some]
-        if not self.sensor.late:
-            return seen - true
+            added = seen - true
+        if not self._late:
+            return added
         sent = np.concatenate([self._sent[rows, 1:], seen[:, None]], axis=1)
         sent[fresh] = seen[fresh, None]
         self._sent[rows] = sent
@@ -372,13 +384,37 @@ class Sensed(Signal):
         self._told[rows] = told
         noise, d = told - true, self.task.chart.dimension
         noise[:, :d] = self.task.chart.difference(told[:, :d], true[:, :d])
+        # A run that is over is measured no more: what its end does, such as a collision, is no move.
+        over = self.task.outcome(true, now.plant.unstable[rows]) != Outcome.RUNNING
+        noise[over] = 0.0
+        self._check_moves(noise, now)
         return noise
+
+    def _check_moves(self, noise: np.ndarray, now: Sample) -> None:
+        """Raises `BadInput` if the robot has moved farther than the noise (n, p) of a delay allows for."""
+        if (beyond := np.abs(noise) > self.limits).any():
+            row, column = np.argwhere(beyond)[0]
+            at = f"column {column} at sample {now.k[row]} of simulation {now.rows[row]}"
+            raise BadInput(
+                f"a measurement of {self.task.name} is off by {abs(noise[row, column]):.6g} in {at}, where "
+                f"{self._reach[column]:.6g} was allowed for: the robot moves farther in one sample than the "
+                f"{self.task.moves[column]:.6g} that trials have shown, so no bound covers its sensor's delay"
+            )
 
 
 def covers_sensor(task: Task, bound: float) -> bool:
-    """Returns whether a task has a sensor of its own, and noise up to a bound covers all that it does."""
+    """Returns whether a task has a sensor, and a bound of noise covers all that it does to chart points."""
     if not task.sensor:
         return False
-    d = task.chart.dimension
-    reach = Sensor.parse(task.sensor).reach(task)[:d]
-    return bool((reach <= task.noise_in_chart(bound) + 10.0**-DECIMALS).all())
+    reach = Sensor.parse(task.sensor).reach(task)[: task.chart.dimension]
+    return bool((reach <= task.noise_in_chart(bound) + 1 / DECIMALS).all())
+
+
+def usual_kinds(task: Task, bound: float) -> tuple[str, ...]:
+    """Returns the kinds of noise by which controllers of a task are judged under noise of a bound.
+
+    Where samples take long, an adversary that looks ahead takes too long; an attack is there. What the task's
+    own sensor does is one of them if the bound covers it.
+    """
+    kinds = KINDS if task.effort.looks_ahead else KINDS[:-1]
+    return (*kinds, SENSOR) if covers_sensor(task, bound) else kinds

@@ -95,7 +95,7 @@ class Task(Problem):
     def with_noise(self, shares: Sequence[float]) -> Self:
         """Returns this task with other shares (p,) of the noise bound on the columns of the measurement."""
         task = copy(self)
-        task.noisy, task.sensor_shares = tuple(shares), self.sensor_shares or tuple(self.noisy)
+        task.noisy = tuple(shares)
         return task
 
     def with_sensor(self, sensor: str, shares: Sequence[float]) -> Self:
@@ -104,7 +104,7 @@ class Task(Problem):
         The sensor's own noise keeps the shares that the noise has had so far; see `hyrl_mj.Sensor`.
         """
         task = self.with_noise(shares)
-        task.sensor = sensor
+        task.sensor, task.sensor_shares = sensor, self.sensor_shares or tuple(self.noisy)
         return task
 
     def noise_on(self, everywhere: bool = False) -> tuple[str, str]:

@@ -91,7 +91,7 @@ def _again(run: Run) -> Settings:
         run.task, s.preset, noise=s.noise, seed=s.seed, horizon=s.horizon,
         agent=run.agent, algorithm=algorithm,
     )  # fmt: skip
-    return replace(again, everywhere=s.everywhere, sensor=s.sensor, shares=s.shares)
+    return replace(again, everywhere=s.everywhere, sensor=s.sensor)
 
 
 def _is_known(run: Run) -> bool:
