@@ -79,8 +79,8 @@ def test_bad_bounds_are_named(bound):
 
 
 def test_an_unknown_kind_lists_the_known():
-    with pytest.raises(BadInput, match=r"'gaussian'.*none, uniform, alternating"):
-        Noise("gaussian", 0.1)
+    with pytest.raises(BadInput, match=r"'pink'.*none, uniform, alternating"):
+        Noise("pink", 0.1)
 
 
 def test_a_misspelt_kind_gets_a_hint():

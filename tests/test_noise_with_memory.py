@@ -25,7 +25,7 @@ def drift():
 
     @register_noise
     class Drift(Signal):
-        kind = "drift"
+        kind = "climb"
 
         def reset(self, n, rng):
             super().reset(n, rng)
@@ -38,7 +38,7 @@ def drift():
             return self.offset[now.rows] * self.shares
 
     yield Drift
-    del _KINDS["drift"]
+    del _KINDS["climb"]
 
 
 def drifted(k, bound=0.1):
@@ -48,8 +48,8 @@ def drifted(k, bound=0.1):
 
 def test_it_works_in_simulate(vehicle):
     z0 = np.array([[0.0, 0.5], [0.3, -0.5]])
-    for arc in simulate(vehicle, sign_policy(vehicle), z0, Noise("drift", 0.1)):
-        assert (arc.noise, arc.bound) == ("drift", 0.1)
+    for arc in simulate(vehicle, sign_policy(vehicle), z0, Noise("climb", 0.1)):
+        assert (arc.noise, arc.bound) == ("climb", 0.1)
         off = (arc.measured - arc.z)[:-1]
         np.testing.assert_allclose(off[:, 0], 0.0, atol=1e-9)
         np.testing.assert_allclose(off[:, 1], drifted(np.arange(len(off))), atol=1e-9)
@@ -57,7 +57,7 @@ def test_it_works_in_simulate(vehicle):
 
 
 def test_it_acts_everywhere_if_asked_to(vehicle):
-    arc = simulate(vehicle, sign_policy(vehicle), [0.0, 0.5], Noise("drift", 0.1, everywhere=True))
+    arc = simulate(vehicle, sign_policy(vehicle), [0.0, 0.5], Noise("climb", 0.1, everywhere=True))
     np.testing.assert_allclose((arc.measured - arc.z)[15], [0.1, 0.1], atol=1e-9)
 
 
@@ -68,19 +68,19 @@ def test_loops_do_not_share_its_memory(vehicle, drift):
     other.reset(3, np.random.default_rng(0))
     assert (len(one.offset), len(other.offset)) == (2, 3)
     # A signal that has no name is noise, too.
-    assert simulate(vehicle, sign_policy(vehicle), [0.0, 0.5], signal).noise == "drift"
+    assert simulate(vehicle, sign_policy(vehicle), [0.0, 0.5], signal).noise == "climb"
 
 
 def test_it_works_in_noisy_episodes(vehicle):
     loops = {"ideal": ideal_controller(vehicle, 0.154, clear=1.004)}
-    noises = (Noise("drift", 0.1), Noise("uniform", 0.1))
+    noises = (Noise("climb", 0.1), Noise("uniform", 0.1))
     records = noisy_episodes(vehicle, Regions(decisions(vehicle).points), loops, noises, 200).counts
-    assert {r.noise for r in records} == {"drift", "uniform"}
-    assert sum(r.episodes for r in records if r.noise == "drift") == 200
+    assert {r.noise for r in records} == {"climb", "uniform"}
+    assert sum(r.episodes for r in records if r.noise == "climb") == 200
 
 
 def test_episodes_that_reset_at_different_times_restart_their_rows(vehicle):
-    env = BatchedEnv(vehicle, 3, noise=Noise("drift", 0.1))
+    env = BatchedEnv(vehicle, 3, noise=Noise("climb", 0.1))
     env.seed(0)
     still, age = np.zeros((3, 1)), np.zeros(3, dtype=int)
 
@@ -101,7 +101,7 @@ def test_episodes_that_reset_at_different_times_restart_their_rows(vehicle):
 
 
 def test_it_works_in_gymnasium(vehicle):
-    noise = Noise("drift", 0.1)
+    noise = Noise("climb", 0.1)
     env = gym.make(vehicle.env_id, noise=noise)
     for _ in range(2):  # a new episode starts over
         observation, info = env.reset(seed=0, options={"z": [0.0, 0.5]})
@@ -149,7 +149,7 @@ def command_line(vehicle, monkeypatch, tmp_path):
 
 def test_its_name_works_on_the_command_line(command_line, tmp_path, capsys):
     start = ("simulate", "run", "--start", "0", "0.5", "--eps", "0.1", "--noise")
-    assert command_line(*start, "drift") in (0, None)
+    assert command_line(*start, "climb") in (0, None)
     assert "hyrl    reached" in capsys.readouterr().out
     arc = HybridArc.load(tmp_path / "hyrl.npz")
     np.testing.assert_allclose((arc.measured - arc.z)[[0, 5, 15], 1], drifted([0, 5, 15]))
@@ -159,11 +159,11 @@ def test_its_name_works_on_the_command_line(command_line, tmp_path, capsys):
 
 def test_a_kind_is_registered_once(drift):
     assert register_noise(drift) is drift, "again is no mistake: a file may be run twice"
-    with pytest.raises(BadInput, match=r"'drift' is already .*Drift, so choose another kind"):
+    with pytest.raises(BadInput, match=r"'climb' is already .*Drift, so choose another kind"):
 
         @register_noise
         class Other(Signal):
-            kind = "drift"
+            kind = "climb"
 
             def sample(self, now):
                 return np.zeros_like(now.measurement)

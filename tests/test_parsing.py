@@ -188,7 +188,7 @@ def test_the_version_is_said(capsys):
     [
         ("", ["give a command, one of list, new-task, run"]),
         ("traim", ["unknown command 'traim'", "Did you mean 'train'?"]),
-        ("run vehicle --nose 0.2", ["unknown option '--nose'", "--eps, --seed"]),
+        ("run vehicle --nose 0.2", ["unknown option '--nose'", "--noise"]),
         ("run", ["give a TASK, see hyrl-mj list"]),
         ("train", ["train needs RUN: a run directory"]),
     ],

@@ -203,7 +203,7 @@ def test_episodes_are_added_on_demand(run):
         ({"episodes": 0}, "0 episodes cannot be simulated"),
         ({"eps": -0.1}, "finite number >= 0"),
         ({"eps": 100.0}, "hides the whole state space"),
-        ({"noise": ("gaussian",)}, "'gaussian'"),
+        ({"noise": ("pink",)}, "'pink'"),
     ],
 )
 def test_an_examination_that_cannot_be_made_leaves_the_last_one(run, options, message):

@@ -50,6 +50,7 @@ OF_RUNS = {
     "resolution": ([0, -1, NAN, 2, 1e-9, "1"], "a number from 1e-06 to 1"),
     "search": (["rod", 1, []], "rods, outcome"),
     "everywhere": ([1, "yes", None], "True or False"),
+    "sensor": (["", 5, "a\x1bb"], "give a text"),
     "ways": ([None, {}, 4.0], "a WaySettings"),
     "overlap": ([None, {}], "OverlapSettings"),
     "modes": ([None, {}], "a ModeSettings"),

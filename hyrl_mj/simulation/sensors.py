@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
-from scipy.special import ndtr, ndtri
 
 from hyrl_mj.errors import BadInput, check_bound, unknown
 from hyrl_mj.simulation.checked_noise import drawn, limits_of
@@ -52,6 +51,8 @@ class Gaussian(Signal):
     sigma: float | None = None
 
     def sample(self, now: Sample) -> np.ndarray:
+        from scipy.special import ndtr, ndtri  # slow to import
+
         sigma = self.bound / 3 if self.sigma is None else self.sigma
         sigma = min(sigma, 1e3 * self.bound)  # from there on it is uniform, to seven digits
         if not self.bound:

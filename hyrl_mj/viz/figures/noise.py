@@ -55,5 +55,5 @@ def draw_noise(noise: LogNoise, path: Path | None = None) -> Figure:
             correlation.vlines(np.arange(len(c.correlations)), 0, c.correlations, **looks)
         if path is not None:
             with artifacts.replacing(path) as png:
-                figure.savefig(png, dpi=DPI)
+                figure.savefig(png, format="png", dpi=DPI)
     return figure
