@@ -180,6 +180,8 @@ def test_what_cannot_be_sensed_is_refused():
         Sensor.parse("uniform 1 + bias 1").on(vehicle)
     with pytest.raises(BadInput, match="adds nothing"):
         Sensor.parse("uniform 0").on(vehicle)
+    with pytest.raises(BadInput, match="field takes a bound of noise, and no sensor"):
+        settings_of(hyrl_mj.get_task("field"), RunOptions(noise="bias 0.05"))
     with pytest.raises(BadInput, match="has no sensor of its own"):
         Noise("sensor", 0.1).against(vehicle, None)
     task = hyrl_mj.from_gymnasium(Puck)

@@ -4,12 +4,14 @@ The chart is the frame of one post: its origin is the post, and its first axis p
 policy learns there holds for every post of a field that it is told to pass.
 """
 
+from collections.abc import Sequence
 from copy import copy
 from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
 
+from hyrl_mj.errors import BadInput
 from hyrl_mj.physics import mjcf
 from hyrl_mj.sets import Chart
 from hyrl_mj.tasks.base import Task
@@ -320,6 +322,10 @@ class Field(FieldTask):
         radius = post[:, 4] + CLEAR
         soon = np.clip(length(to_post) - radius, 0.0, PROJECTED)[:, None]
         return ways_round(to_post + soon * post[:, 2:4], goal, radius)
+
+    def with_sensor(self, sensor: str, shares: Sequence[float]) -> Self:
+        """Refuses: modes are trained under noise of their own, which follows from its bound."""
+        raise BadInput(f"{self.name} takes a bound of noise, and no sensor: give --eps")
 
     def for_mode(self, mode: int) -> Self:
         task = copy(self)
