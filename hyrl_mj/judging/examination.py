@@ -15,12 +15,7 @@ from hyrl_mj.judging.game import MapClass, Maps, Robustness, compare
 from hyrl_mj.judging.worst_case import worst_case
 from hyrl_mj.policies import Controller
 from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.simulation import (
-    AttackSettings,
-    HybridArc,
-    noise_of,
-    usual_kinds,
-)
+from hyrl_mj.simulation import AttackSettings, HybridArc, noise_of, usual_kinds
 from hyrl_mj.tasks import Effort, Task
 
 

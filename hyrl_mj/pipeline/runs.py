@@ -262,8 +262,7 @@ def _settings(task: Task, options: RunOptions | AgentOptions, **changes: Any) ->
         sensor, task = str(parsed), task.with_sensor(str(parsed), shares)
     eps = BOUND if eps is None else eps
     settings = preset(task, options.preset, noise=eps, seed=seed, horizon=horizon, **changes)
-    everywhere = options.all_coordinates
-    settings = replace(settings, everywhere=everywhere, sensor=sensor)
+    settings = replace(settings, everywhere=options.all_coordinates, sensor=sensor)
     if options.set:
         settings = changed(settings, options.set)
     settings.check(task)
