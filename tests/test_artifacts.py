@@ -7,6 +7,7 @@ import zipfile
 
 import numpy as np
 import pytest
+from memory import Peak
 from sentences import assert_one_sentence_about
 
 from hyrl_mj import BadArtifact
@@ -209,6 +210,15 @@ def test_arrays_that_unpack_to_more_than_their_limit_are_refused(tmp_path):
     artifacts.write_arrays(tmp_path / "a.npz", {"x": np.zeros(2**16), "y": np.ones(3)}, "kind")
     found = artifacts.read_arrays(tmp_path / "a.npz", "kind", 2**20)
     assert {name: array.shape for name, array in found.items()} == {"x": (2**16,), "y": (3,)}
+
+
+def test_the_largest_arrays_are_in_memory_once(tmp_path):
+    content = {"kind": "kind", "version": artifacts.VERSION, "x": np.zeros(2**23)}  # 64 MiB
+    np.savez(tmp_path / "a.npz", **content)
+    with Peak() as peak:
+        found = artifacts.read_arrays(tmp_path / "a.npz", "kind")
+    assert len(found["x"]) == 2**23
+    assert peak.megabytes < 80
 
 
 @pytest.mark.parametrize("packing", [zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2])

@@ -100,9 +100,14 @@ def read_limited(path: Path, limit: int = LARGEST) -> bytes:
     """Returns the content of a file, if it is no longer than the limit [bytes]."""
     with path.open("rb") as file:
         content = file.read(limit + 1)
-    if len(content) > limit:
-        raise BadArtifact(f"it is larger than {limit / 2**20:g} MiB, which no such file is")
+    check_size(len(content), limit)
     return content
+
+
+def check_size(size: int, limit: int = LARGEST) -> None:
+    """Raises `BadArtifact` if a file is larger than the limit [bytes]."""
+    if size > limit:
+        raise BadArtifact(f"it is larger than {limit / 2**20:g} MiB, which no such file is")
 
 
 def digest(path: Path) -> str:
@@ -324,7 +329,8 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], kind: str) -> Non
 def read_arrays(path: Path, kind: str, limit: int = LARGEST) -> dict[str, np.ndarray]:
     """Returns the arrays that `write_arrays` wrote, which take no more than the limit [bytes]."""
     with reading(path):
-        content = archives.read_npz(read_limited(path), limit)
+        check_size(path.stat().st_size)
+        content = archives.read_npz(path, limit)
         check_version(int(content.pop("version")), str(content.pop("kind")), kind)
         return content
 
