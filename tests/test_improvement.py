@@ -58,6 +58,24 @@ def test_a_bootstrap_covers_the_mean():
     assert 0.8 <= np.mean(held) <= 1
 
 
+def test_an_interval_tells_of_the_starts_that_were_tried():
+    def tried(starts):
+        rows = [row(CIRCLE, i, 0.5, 0.8, "withstood_attack") for i in range(4)]
+        for one in rows:
+            one.figures["attacked"] = starts
+        (found,) = improvements(rows)
+        return found
+
+    assert tried(0).hyrl.interval == pytest.approx((0.8, 0.8))
+    found = tried(100)
+    # Of four runs with 100 starts each; the variances of both controllers add up.
+    off = 1.96 * (0.8 * 0.2 / 400) ** 0.5
+    assert found.hyrl.interval == pytest.approx((0.8 - off, 0.8 + off), abs=0.01)
+    off = 1.96 * ((0.8 * 0.2 + 0.5 * 0.5) / 400) ** 0.5
+    assert found.difference.interval == pytest.approx((0.3 - off, 0.3 + off), abs=0.01)
+    assert found == tried(100), "the same numbers again"
+
+
 def test_profiles_are_shares_of_runs_that_reach_a_threshold():
     rows = [row(CIRCLE, i, p, 1.0) for i, p in enumerate((0.5, 0.9, 1.0))]
     shares = profile(rows, "proved", np.array([0.0, 0.6, 0.95, 1.0]))

@@ -182,7 +182,7 @@ def test_the_least_share_of_episodes_may_be_none(circle):
         for region, reached in (("near M*", 0.0), ("elsewhere", 0.8))
     )
     found = sweeps._figures(hyrl_mj.Robustness(0.1, False, None, counts, 0))
-    assert found == {"hyrl_reached_none": 0.0}
+    assert found == {"hyrl_reached_none": 0.0, "episodes_none": 5}
 
 
 def test_without_ray_one_sentence_says_how_to_install_it(tmp_path):

@@ -1,13 +1,15 @@
 """HyRL against the policy over the runs of a sweep: means, differences and how often it is better.
 
 The intervals are those of a bootstrap over the seeds, stratified by the settings of the sweep, as Agarwal et
-al. (2021, arXiv:2108.13264) ask for where there are few runs. How much the starts of one run vary is told by
-the intervals of its own comparisons.
+al. (2021, arXiv:2108.13264) ask for where there are few runs. Where a run has tried a sample of its starts,
+these are drawn again, too: of n starts of which a share s is won, n are won with probability s. Both
+controllers are drawn apart, although they were tried from the same starts: if what one of them loses is more
+likely lost by the other, the interval of their difference is wider than it needs to be.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +26,11 @@ COMPARED = {
     "withstood_attack": True,
     "late": False,
     "longest": False,
+}
+# The figures that are shares of a sample of starts, and the one that tells of how many.
+SAMPLED = {
+    **{f"reached_{kind}": f"episodes_{kind}" for kind in KINDS},
+    "withstood_attack": "attacked",
 }
 # Seeds of each setting from which an interval is computed.
 LEAST_SEEDS = 3
@@ -63,48 +70,63 @@ def improvements(rows: Iterable[Row]) -> list[Improvement]:
     done = [row for row in rows if row.done]
     found = []
     for figure, more in COMPARED.items():
-        groups: dict[Setting, list[tuple[float, float]]] = {}
+        groups: dict[Setting, list[tuple[float, float, float]]] = {}
         for row in done:
-            pair = (row.figures.get(f"policy_{figure}"), row.figures.get(f"hyrl_{figure}"))
-            if pair[0] is not None and pair[1] is not None:
-                groups.setdefault(row.setting, []).append((pair[0], pair[1]))
+            policy, hyrl = (row.figures.get(f"{who}_{figure}") for who in ("policy", "hyrl"))
+            if policy is not None and hyrl is not None:
+                starts = row.figures.get(SAMPLED.get(figure, "")) or 0.0
+                groups.setdefault(row.setting, []).append((policy, hyrl, starts))
         if groups:
             found.append(_improvement(figure, more, [np.array(g) for g in groups.values()]))
     return found
 
 
 def _improvement(figure: str, more: bool, groups: Sequence[np.ndarray]) -> Improvement:
-    """Returns the improvement of a figure, from the pairs (seeds, 2) of each setting."""
+    """Returns the improvement of a figure.
+
+    Args:
+        figure: its name.
+        more: whether more of it is better.
+        groups: for each setting the values (seeds, 3) of policy and HyRL, and the number of starts that were
+            tried, 0 for a figure that is not a share of them.
+    """
     better = []
-    for pairs in groups:
-        apart = (pairs[None, :, 1] - pairs[:, None, 0]) * (1 if more else -1)
+    for runs in groups:
+        apart = (runs[None, :, 1] - runs[:, None, 0]) * (1 if more else -1)
         better.append(float(np.mean((apart > 0) + (apart == 0) / 2)))
-    policy, hyrl, difference = (
-        _mean(groups, of)
-        for of in (lambda p: p[:, 0], lambda p: p[:, 1], lambda p: p[:, 1] - p[:, 0])
+    policy, hyrl, difference = (_mean(groups, np.array(by)) for by in ((1, 0), (0, 1), (-1, 1)))
+    return Improvement(
+        figure, sum(map(len, groups)), policy, hyrl, difference, float(np.mean(better))
     )
-    runs = sum(map(len, groups))
-    return Improvement(figure, runs, policy, hyrl, difference, float(np.mean(better)))
 
 
-def _mean(groups: Sequence[np.ndarray], of: Callable[[np.ndarray], np.ndarray]) -> Mean:
-    """Returns the mean of what `of` gives of each setting's pairs, with its interval."""
+def _mean(groups: Sequence[np.ndarray], by: np.ndarray) -> Mean:
+    """Returns the mean of both values of each run (seeds, 3), times `by` (2,), with its interval."""
     from scipy.stats import bootstrap  # slow to import, and seldom needed
 
-    def mean(*samples: np.ndarray, axis: int = -1) -> np.ndarray:
-        return np.mean([np.mean(sample, axis=axis) for sample in samples], axis=0)
+    rng = np.random.default_rng(0)
 
-    values = [of(pairs) for pairs in groups]
-    whole = float(mean(*values))
-    if min(map(len, values)) < LEAST_SEEDS:
+    def mean(*chosen: np.ndarray, axis: int = -1) -> np.ndarray:
+        means = []
+        for runs, numbers in zip(groups, chosen, strict=True):
+            drawn = runs[numbers.astype(int)]
+            values, starts = drawn[..., :2], drawn[..., 2:]
+            sampled = starts[..., 0] > 0
+            n = starts[sampled].astype(int)
+            values[sampled] = rng.binomial(n, values[sampled]) / n
+            means.append((values @ by).mean(axis=axis))
+        return np.mean(means, axis=0)
+
+    whole = float(np.mean([(runs[:, :2] @ by).mean() for runs in groups]))
+    if min(map(len, groups)) < LEAST_SEEDS:
         return Mean(whole, None)
     found = bootstrap(
-        values,
+        [np.arange(len(runs)) for runs in groups],
         mean,
         n_resamples=9_999,
         method="percentile",
         vectorized=True,
-        random_state=np.random.default_rng(0),
+        random_state=rng,
     ).confidence_interval
     return Mean(whole, (float(found.low), float(found.high)))
 

@@ -275,8 +275,9 @@ def _figures(robustness: Robustness) -> dict[str, float | None]:
     if (game := robustness.deciding) is None:
         least: dict[str, float] = {}
         for count in robustness.episodes:
-            name = f"{count.controller}_reached_{count.noise}"
+            name, episodes = f"{count.controller}_reached_{count.noise}", f"episodes_{count.noise}"
             least[name] = min(count.reached, least.get(name, 1.0))
+            least[episodes] = min(count.episodes, least.get(episodes, count.episodes))
         return {**least, **_compared(robustness)}
     last = game.scores["hyrl"][-1]
     figures: dict[str, float | None] = {"open": last.open, "winnable": last.winnable}
@@ -303,6 +304,8 @@ def _compared(robustness: Robustness) -> dict[str, float]:
     figures: dict[str, float] = {}
     for compared in robustness.comparisons:
         n = max(compared.compared, 1)
+        if compared.noise == "attack":
+            figures["attacked"] = compared.compared
         for who in compared.lost:
             if compared.noise == "attack":
                 figures[f"{who}_withstood_attack"] = 1 - compared.lost[who] / n

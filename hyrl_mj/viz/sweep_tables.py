@@ -117,7 +117,7 @@ def improvement_table(sweep: Sweep) -> Table | None:
         cells = [_with_interval(one.policy, show), _with_interval(one.hyrl, show)]
         rows.append([heading, f"{one.runs}", *cells, _with_interval(one.difference, signed)])
         rows[-1].append(f"{one.better:.2f}")
-    title = "HyRL against the RL policy: means, 95% intervals (bootstrap over the seeds)"
+    title = "HyRL against the RL policy: means, 95% intervals (bootstrap over seeds and starts)"
     headings = ("figure", "runs", "RL policy", "HyRL", "difference", "probability of improvement")
     return Table(title, headings, rows)
 
