@@ -498,7 +498,7 @@ def test_python_code_is_named_by_its_module_and_object(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_diagnosis_says_so_and_goes_on(circle, tmp_path):
+def test_a_diagnosis_says_so_and_goes_on(small_runs, circle, tmp_path):
     said, out = [], tmp_path / "run"
     run = hyrl_mj.diagnose("unit_circle", Chunked(), preset="smoke", out=out, say=said.append)
     assert any("it has a memory: noisy episodes stand in for the worst" in line for line in said)

@@ -237,7 +237,7 @@ def test_what_is_no_log_of_a_task_is_refused(log, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def late(tmp_path_factory):
+def late(small_runs, tmp_path_factory):
     """A small run that is made for a sensor."""
     out = tmp_path_factory.mktemp("late") / "run"
     text = "uniform 0.05 + bias 0.05 + delay 1"

@@ -1,0 +1,442 @@
+"""Which noise a sensor has, from one column of what it measured, and what was true."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from math import nan
+
+import numpy as np
+
+from hyrl_mj.errors import BadInput
+from hyrl_mj.tasks import wrapped
+
+LONGEST_DELAY = 100  # [samples]: later than that no controller can act upon
+LEAST = 50  # samples: fewer do not tell noise from motion
+# With which a test finds what is not there: once in 10,000 columns.
+CHANCE = 1e-4
+ENDS = 0.002, 0.998  # quantiles between which drift is taken: beyond them is mostly noise
+MOST_LAGS = 40  # of the autocorrelation [samples]
+# Ratios of a measurement to its reference that are a mistake about units.
+UNITS = {
+    f"{a} against {b}": factor
+    for a, b, x in (("mm", "m", 1000), ("cm", "m", 100), ("degrees", "radians", 180 / np.pi))
+    for a, b, factor in ((a, b, x), (b, a, 1 / x))
+}
+
+
+@dataclass(frozen=True)
+class ColumnNoise:
+    """The noise of one column of a log, in its unit; NaN is what the log does not tell.
+
+    Attributes:
+        name: of the column.
+        delay: how late it is [samples].
+        held: how many samples were held or lost in a row at most.
+        held_rate: the probability with which one is.
+        quantum: the step to which it is rounded.
+        bias: the constant error.
+        told_bias: its magnitude, 0 if it lies within the error of its estimate.
+        drift: largest magnitude of the slow error beside the bias.
+        drift_rate: how fast this changes, in the unit each second.
+        bound: what a share of what is left of the error keeps.
+        sigma: standard deviation of what is left.
+        uniform: whether what is left is nearer to uniform than to normal noise.
+        correlation: of what is left, from one sample to the next.
+        remarks: sentences on what the log does not tell, or what no noise does.
+        times: (n,) of the samples that were not held [s].
+        errors: (n,) measurement minus delayed reference.
+        slow: (n,) bias and drift.
+        correlations: (lags,) autocorrelation of what is left, from lag 0 on.
+    """
+
+    name: str
+    delay: float = nan
+    held: int = 0
+    held_rate: float = 0.0
+    quantum: float = 0.0
+    bias: float = nan
+    told_bias: float = 0.0
+    drift: float = 0.0
+    drift_rate: float = 0.0
+    bound: float = 0.0
+    sigma: float = 0.0
+    uniform: bool = False
+    correlation: float = 0.0
+    remarks: tuple[str, ...] = ()
+    times: np.ndarray = field(default_factory=lambda: np.empty(0))
+    errors: np.ndarray = field(default_factory=lambda: np.empty(0))
+    slow: np.ndarray = field(default_factory=lambda: np.empty(0))
+    correlations: np.ndarray = field(default_factory=lambda: np.empty(0))
+
+    @property
+    def text(self) -> str:
+        """The noise to give to a run, as "uniform 0.05 + bias 0.02"; "none" if there is none."""
+        parts = []
+        if self.bound and self.uniform:
+            parts.append(f"uniform {self.bound:.3g}")
+        elif self.bound:
+            usual = abs(3 * self.sigma - self.bound) < 0.1 * self.bound
+            parts.append(f"gaussian {self.bound:.3g}" + f" sigma {self.sigma:.3g}" * (not usual))
+        if self.told_bias:
+            parts.append(f"bias {self.told_bias:.3g}")
+        if self.drift:
+            rate = f" rate {self.drift_rate:.3g}" * bool(self.drift_rate)
+            parts.append(f"drift {self.drift:.3g}{rate}")
+        if self.delay >= 1:
+            parts.append(f"delay {self.delay:.0f}")
+        if self.held:
+            parts.append(f"hold {self.held} rate {self.held_rate:.3g}")
+        if self.quantum:
+            parts.append(f"quantum {self.quantum:.3g}")
+        return " + ".join(parts) or "none"
+
+
+def column_noise(
+    name: str,
+    y: np.ndarray,
+    r: np.ndarray | None,
+    t: np.ndarray,
+    dt: float,
+    turn: bool,
+    share: float,
+) -> ColumnNoise:
+    """Returns the noise of one column.
+
+    Args:
+        name: of the column.
+        y: (n,) measurements, NaN in gaps.
+        r: (n,) references; None of a robot at rest.
+        t: (n,) times [s], NaN in gaps.
+        dt: the time of a sample [s].
+        turn: whether it is an angle [rad], whose difference by a whole turn is none.
+        share: the share of the samples that keeps the bound.
+
+    Raises:
+        BadInput: the measurement has another unit than its reference.
+    """
+    from scipy import stats  # slow to import
+
+    known = np.isfinite(y)
+    if known.sum() < LEAST:
+        return ColumnNoise(name, remarks=(f"{name} has fewer than {LEAST} numbers",))
+    tiny = 1e-9 * float(np.nanmax(np.abs(y)))  # more than the rounding of floats does
+    if np.ptp(y[known]) <= tiny:
+        return ColumnNoise(name, remarks=(f"{name} never changes, so its noise cannot be told",))
+    remarks = ["without a reference, bias and delay cannot be told"] if r is None else []
+    if r is None:
+        reference = np.full(len(y), np.median(y[known]))
+    else:
+        reference = r
+        _check_units(name, y, r)
+    last = np.maximum.accumulate(np.where(known, np.arange(len(y)), 0))
+    again = ~known | (np.abs(y - np.concatenate([y[:1], y[last[:-1]]])) <= tiny)
+    again[: np.argmin(again | (np.arange(len(y)) <= np.argmax(known)))] = False  # before it moves
+    quantum = _quantum(y[known & ~again], int(known.sum()), tiny)
+    # A quantum repeats measurements, too: held are those which are repeated where the reference moves on.
+    fresh, delay, said = known if quantum else known & ~again, nan, list[str]()
+    for _ in range(2 if quantum else 1):
+        if r is not None:
+            delay, said = _delay(name, y, r, fresh, turn)
+        late = _shifted(reference, 0 if np.isnan(delay) else int(delay))
+        raw = wrapped(y - late) if turn else y - late
+        used = fresh & np.isfinite(raw)
+        if used.sum() < LEAST:
+            why = f"{name} has fewer than {LEAST} samples with a reference that are not held"
+            return ColumnNoise(name, remarks=(why,))
+        kept = np.clip(raw, *np.quantile(raw[used], [(1 - share) / 2, (1 + share) / 2]))
+        slow, drift, rate, unsure = _drift(np.where(used, kept, nan), dt, tiny)
+        left = raw - slow
+        sigma, bound, uniform = _spread(left[used], quantum, share, tiny, drift)
+        repeated = _repeated(late + slow, left[used], sigma, quantum, tiny)
+        moves = repeated < 0.5
+        by_chance = float(np.mean(repeated[moves])) if moves.any() else 1.0
+        # Where between two steps of a quantum the reference lies is known to about a hundredth.
+        by_chance = max(by_chance, 0.01 if quantum else 0.0)
+        held, held_rate = _held(again, moves & np.isfinite(t), by_chance)
+        fresh = known & ~(again & moves) if held else fresh
+    if moves.sum() < 0.5 * known.sum():
+        said = [*said, f"{name} moves too little between samples for held ones to be told"]
+        held, held_rate = 0, 0.0
+    if r is not None:
+        remarks += [*said, *([] if turn else _slope(name, y[used], late[used]))]
+    else:
+        remarks += said
+    correlations = _autocorrelation(left, used)
+    middle = sum(np.quantile(slow, ENDS)) / 2
+    correlation = float(correlations[1])
+    if bound and abs(correlation) > max(0.2, stats.norm.isf(CHANCE) / np.sqrt(used.sum())):
+        steps = np.abs(np.diff(left))
+        fast = np.nanquantile(steps[used[1:] & used[:-1]], 0.95) / dt
+        remarks.append(
+            f"what is left of {name} is correlated from sample to sample ({correlation:.2f}): "
+            f"drift {bound:.3g} rate {fast:.3g} describes it better"
+        )
+    if unsure:
+        remarks.append(f"the drift of {name} is too small in its noise for its rate to be sure")
+    if (over := np.abs(left[used]).max()) > 2 * (bound + quantum / 2 + drift / 20) + tiny:
+        remarks.append(f"some samples of {name} are beyond the bound, the farthest by {over:.3g}")
+    unsure_bias = max(3 * sigma / np.sqrt(used.sum()), drift / 20, quantum / 20)
+    return ColumnNoise(
+        name,
+        delay=delay if r is not None else nan,
+        held=held,
+        held_rate=held_rate,
+        quantum=quantum if quantum > sigma / 100 else 0.0,  # a smaller one changes nothing
+        bias=nan if r is None else float(middle),
+        told_bias=abs(float(middle)) if r is not None and abs(middle) > unsure_bias else 0.0,
+        drift=drift,
+        drift_rate=rate,
+        bound=bound,
+        sigma=sigma,
+        uniform=uniform,
+        correlation=correlation,
+        remarks=tuple(remarks),
+        times=t[used],
+        errors=raw[used],
+        slow=slow[used],
+        correlations=correlations,
+    )
+
+
+def _autocorrelation(left: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Returns the autocorrelation, from lag 0 on, of the values (n,) that are used (n,)."""
+    from scipy import signal
+
+    white = np.where(used, left - left[used].mean(), 0.0)
+    sums, counts = (
+        signal.correlate(x, x, method="fft")[len(x) - 1 :][: MOST_LAGS + 1]
+        for x in (white, used.astype(float))
+    )
+    pairs = sums / np.maximum(counts, 1)
+    return pairs / max(float(pairs[0]), 1e-300)
+
+
+def _check_units(name: str, y: np.ndarray, r: np.ndarray) -> None:
+    """Raises `BadInput` if a measurement has another unit than its reference."""
+    from scipy import stats
+
+    both = np.isfinite(y) & np.isfinite(r)
+    moves = stats.iqr(r[both]) if both.any() else 0.0
+    ratio = stats.iqr(y[both]) / moves if moves else 1.0
+    for units, factor in UNITS.items():
+        if abs(ratio / factor - 1) < 0.05:
+            raise BadInput(
+                f"{name} changes {ratio:.4g} times as much as {name}_ref, as {units}: give --scale "
+                f"{name}={1 / factor:.6g}"
+            )
+
+
+def _slope(name: str, y: np.ndarray, r: np.ndarray) -> list[str]:
+    """Returns a remark if a measurement changes more or less than its reference."""
+    from scipy import stats
+
+    if np.ptp(r) == 0:
+        return []
+    line = stats.linregress(r, y)
+    if abs(line.slope - 1) <= max(0.05, 4 * line.stderr):
+        return []
+    return [
+        f"{name} changes {line.slope:.3g} times as much as its reference, which no noise does: if its scale "
+        f"is wrong, give --scale {name}={1 / line.slope:.4g}"
+    ]
+
+
+def _shifted(values: np.ndarray, lag: int) -> np.ndarray:
+    """Returns values (n,) as they were `lag` samples before, NaN where that is not known."""
+    moved = np.full(len(values), nan)
+    if lag >= 0:
+        moved[lag:] = values[: len(values) - lag]
+    else:
+        moved[:lag] = values[-lag:]
+    return moved
+
+
+def _delay(
+    name: str, y: np.ndarray, r: np.ndarray, fresh: np.ndarray, turn: bool
+) -> tuple[float, list[str]]:
+    """Returns by how many samples y is later than r, by least squares; NaN and why if it cannot be told.
+
+    A line is taken out of each tenth of the error, because drift is no delay.
+    """
+    from scipy import signal, stats
+
+    most = min(LONGEST_DELAY, len(y) // 8)
+    lags = np.arange(-most // 10, most + 1)
+    squares = np.full(len(lags), np.inf)
+    for i, lag in enumerate(lags.tolist()):
+        error = y - _shifted(r, lag)
+        error = error[fresh & np.isfinite(error)]
+        if len(error) >= LEAST:
+            error = wrapped(error) if turn else error
+            parts = np.linspace(0, len(error), 11).astype(int)[1:-1]
+            squares[i] = np.mean(signal.detrend(error, bp=parts) ** 2)
+    i = int(np.clip(np.argmin(squares), 1, len(lags) - 2))
+    beside, best = squares[[i - 1, i + 1]], max(squares[i], 1e-300)
+    if not np.isfinite(beside).all():
+        return nan, [f"{name} has too few samples with a reference for a delay to be told"]
+    # Twice the logarithm of the likelihood ratio of the next best delay.
+    sure = fresh.sum() * np.log(max(beside.min(), best) / best)
+    if sure < stats.chi2.isf(CHANCE, 1):
+        return nan, [f"{name}_ref moves too little for a delay to be told"]
+    if squares[i] > squares.min():
+        return nan, [f"{name} may be more than {most} samples late: give a longer log"]
+    middle = lags[i] + 0.5 * (beside[0] - beside[1]) / (beside.sum() - 2 * best)
+    if middle < -0.5:
+        return nan, [
+            f"{name} is {-middle:.1f} samples earlier than its reference: its delay cannot be told"
+        ]
+    # The error of the vertex is about 1 / sqrt(sure) samples.
+    if abs(middle - lags[i]) > max(0.25, 3 / np.sqrt(sure)):
+        more = float(max(np.ceil(middle), 0))
+        return more, [f"{name} is {middle:.1f} samples late, which is taken as {more:.0f}"]
+    return float(lags[i]), []
+
+
+def _quantum(values: np.ndarray, samples: int, tiny: float) -> float:
+    """Returns the step of which all differences between values are multiples, 0 if there is none."""
+    if not len(values):
+        return 0.0
+    distinct = np.unique(values)
+    distinct = distinct[np.concatenate([[True], np.diff(distinct) > tiny])]
+    gaps = np.diff(distinct)
+    # That ten differences are multiples by chance, within a tenth, has a chance of 0.2 ** 9.
+    if not len(gaps) or (len(gaps) < 10 and samples < 10 * len(distinct)):
+        return 0.0
+    step = float(gaps[gaps < 1.5 * gaps.min()].mean())
+    if (np.abs(gaps / step - np.rint(gaps / step)) > 0.1).any():
+        return 0.0
+    return float(gaps.sum() / np.rint(gaps / step).sum())
+
+
+def _repeated(
+    smooth: np.ndarray, left: np.ndarray, sigma: float, quantum: float, tiny: float
+) -> np.ndarray:
+    """Returns the probability (n,) with which a measurement that is not held is that before it.
+
+    Args:
+        smooth: (n,) reference, bias and drift.
+        left: (k,) errors besides these; they are shuffled, scaled to the deviation `sigma`.
+        sigma: standard deviation of the noise without the quantum.
+        quantum: to which measurements are rounded.
+        tiny: the rounding of floats.
+    """
+    rng, scale, times = np.random.default_rng(0), sigma / max(float(np.std(left)), tiny), 20
+    same = np.zeros(len(smooth))
+    for _ in range(times):
+        y = smooth + scale * rng.choice(left, len(smooth))
+        y = np.rint(y / quantum) * quantum if quantum else y
+        same[1:] += np.where(np.isnan(np.diff(y)), times, np.abs(np.diff(y)) <= tiny)
+    same[0] = times
+    return same / times
+
+
+def _held(again: np.ndarray, moves: np.ndarray, chance: float) -> tuple[int, float]:
+    """Returns how many samples were held in a row at most, and with which probability one is.
+
+    Args:
+        again: (n,) whether a measurement is that before it.
+        moves: (n,) whether one that is not held would seldom be.
+        chance: the probability of that.
+    """
+    from scipy import stats
+
+    row = np.zeros(len(again), dtype=int)
+    for k in np.flatnonzero(again & moves):
+        row[k] = row[k - 1] + 1
+    most, rate = 0, 0.0
+    while True:
+        # With at most that many held in a row, a longer row has one in it that is repeated by chance.
+        by_chance = (1 - rate) * chance
+        both = rate + by_chance
+        ratio = both - rate**most * (rate - (chance - by_chance)) / max(both, 1e-300) ** most
+        base = int((moves if most == 0 else row == most).sum())
+        longer = int((row == most + 1).sum())
+        ratio = min(max(ratio, 0.0), 1.0)
+        # One too many does little harm, but none is none.
+        enough = CHANCE if most == 0 else 100 * CHANCE
+        if not longer or stats.binomtest(longer, base, ratio, "greater").pvalue > enough:
+            return most, rate
+        most += 1
+        could = moves[1:] & (row[:-1] < most)
+        share = float((again[1:] & could).sum() / could.sum())
+        rate = max((share - chance) / max(1 - chance, 1e-300), 0.0)
+
+
+def _drift(error: np.ndarray, dt: float, tiny: float) -> tuple[np.ndarray, float, float, bool]:
+    """Returns bias and drift (n,), the bound of the drift, its rate, and whether that is unsure.
+
+    The error (n,) is NaN where it is not known.
+
+    White noise leaves the means of blocks uncorrelated; drift is where, for some length of the blocks, more
+    than half of their variance goes on in the next one.
+    """
+    from scipy import signal, stats
+
+    n, known, persists, length = len(error), np.isfinite(error), False, 8
+    while n // length >= 16 and not persists:
+        means = _means(error, length)
+        means -= means.mean()
+        correlation = (means[1:] @ means[:-1]) / max(means @ means, 1e-300)
+        enough = stats.norm.isf(CHANCE) / np.sqrt(len(means))
+        persists = bool(correlation > max(0.5, enough))
+        length *= 2
+    if not persists or np.ptp(error[known]) < tiny:
+        return np.full(n, error[known].mean()), 0.0, 0.0, False
+    # 2,000 blocks are more than the turns of a drift that can be told.
+    length = max(1, n // 2_000)
+    means, each = _means(error, length), length * dt
+    # Of white noise, by second differences, which a slope does not change; and of the mean of a block.
+    sigma = np.sqrt(np.nanmean(np.diff(error, 2) ** 2) / 6 / (length * known.mean()))
+    best = np.inf, 5, 0.0
+    for window in np.unique((5 * 1.25 ** np.arange(40)).astype(int) // 2 * 2 + 1):
+        if window > len(means) // 4:
+            break
+        slopes = signal.savgol_filter(means, window, 1, deriv=1, delta=each)
+        noise = sigma * np.sqrt(12) / (window**1.5 * each)  # of a slope by least squares
+        rate = np.quantile(np.abs(slopes), 0.95) - stats.norm.ppf(0.95) * noise
+        best = min(best, (noise / max(rate, 1e-300), window, rate))
+        if best[0] < 0.15:  # the shortest window in which noise does not make the slope
+            break
+    unsure, window, rate = best
+    half = max(
+        window // 4 * 2 + 1, 5
+    )  # corners are cut less where a parabola is fitted to half of it
+    smooth = signal.savgol_filter(means, half, 2)
+    # A parabola is uncertain at its ends: there, a line.
+    line = signal.savgol_filter(means, half, 1)
+    smooth[: half // 2], smooth[-half // 2 :] = line[: half // 2], line[-half // 2 :]
+    centres = (np.arange(len(means)) + 0.5) * length - 0.5
+    slow = np.interp(np.arange(n), centres, smooth)
+    return (
+        slow,
+        float(np.ptp(np.quantile(slow, ENDS)) / 2),
+        max(float(rate), 0.0),
+        bool(unsure > 0.25),
+    )
+
+
+def _means(values: np.ndarray, length: int) -> np.ndarray:
+    """Returns the means of blocks of that length, (n // length,), where there are values."""
+    blocks = values[: len(values) // length * length].reshape(-1, length)
+    counts = np.isfinite(blocks).sum(axis=1)
+    some = np.flatnonzero(counts)
+    return np.interp(np.arange(len(blocks)), some, np.nansum(blocks[some], axis=1) / counts[some])
+
+
+def _spread(
+    left: np.ndarray, quantum: float, share: float, tiny: float, drift: float
+) -> tuple[float, float, bool]:
+    """Returns deviation and bound of noise, without what rounding adds, and whether it is uniform."""
+    from scipy import stats
+
+    bound = float(np.quantile(np.abs(left), share))
+    kept = np.clip(left, -bound, bound)
+    whole, rounding = float(np.mean(kept**2)), quantum**2 / 12
+    # Less is what smoothing leaves of a drift, or rounding of floats.
+    if bound <= max(tiny, drift / 20) or whole < 1.1 * rounding:
+        return 0.0, 0.0, False
+    sigma = float(np.sqrt(whole - rounding))
+    if stats.kurtosis(kept) > -0.6:  # that of uniform noise is -1.2, of normal noise 0
+        return sigma, bound * sigma / whole**0.5, False
+    # Smoothing and rounding blur the edges of uniform noise, but not its deviation.
+    return sigma, min(bound, sigma * 3**0.5) if drift or quantum else bound, True
