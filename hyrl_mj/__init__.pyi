@@ -1,8 +1,8 @@
 from . import (
-    environments as environments,
-    envs as envs,
     export as export,
     fields as fields,
+    gym_export as gym_export,
+    gym_import as gym_import,
     judging as judging,
     learning as learning,
     physics as physics,
@@ -15,9 +15,9 @@ from . import (
     tasks as tasks,
     viz as viz,
 )
-from .environments import from_gymnasium
 from .errors import BadArtifact, BadInput, HyrlError, NoRenderer
 from .export import export_numpy, export_onnx
+from .gym_import import from_gymnasium
 from .judging import Verdict
 from .judging.game import Game, Robustness, Score
 from .learning import Settings

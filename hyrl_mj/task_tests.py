@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from hyrl_mj.envs import observation_space
 from hyrl_mj.errors import BadInput
+from hyrl_mj.gym_export import observation_space
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.simulation import LoopSettings, closed_loop
 from hyrl_mj.tasks import Outcome, Task, check_task

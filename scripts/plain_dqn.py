@@ -16,8 +16,8 @@ from stable_baselines3 import DQN
 from stable_baselines3.common.callbacks import EvalCallback
 
 import hyrl_mj
-from hyrl_mj.envs import BatchedEnv
-from hyrl_mj.envs.sb3_env import TaskVecEnv
+from hyrl_mj.gym_export import BatchedEnv
+from hyrl_mj.gym_export.sb3_env import TaskVecEnv
 
 SAMPLES = 300_000
 

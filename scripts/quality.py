@@ -12,7 +12,7 @@ import sys
 import numpy as np
 
 import hyrl_mj
-from hyrl_mj.envs import BatchedEnv
+from hyrl_mj.gym_export import BatchedEnv
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.simulation import closed_loop
 from hyrl_mj.viz import replay_sentence

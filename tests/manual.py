@@ -231,8 +231,8 @@ def agents() -> None:
     from stable_baselines3 import PPO
 
     import hyrl_mj
-    from hyrl_mj.envs import BatchedEnv
-    from hyrl_mj.envs.sb3_env import TaskVecEnv
+    from hyrl_mj.gym_export import BatchedEnv
+    from hyrl_mj.gym_export.sb3_env import TaskVecEnv
 
     circle = hyrl_mj.get_task("unit_circle")
     PPO("MlpPolicy", TaskVecEnv(BatchedEnv(circle, 1)), device="cpu").save("agent.zip")

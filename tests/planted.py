@@ -10,9 +10,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image
 
-from hyrl_mj.environments.task import EnvironmentTask
 from hyrl_mj.files.artifacts import digest
 from hyrl_mj.files.manifest import FILES, Entry, Manifest
+from hyrl_mj.gym_import.task import EnvironmentTask
 from hyrl_mj.judging import worst_case as examination
 from hyrl_mj.judging.proof import counterexamples, replays
 from hyrl_mj.learning import distillation, presets

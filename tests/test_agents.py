@@ -17,8 +17,8 @@ from torch import nn
 
 import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, MlpPolicy, from_callable, load_agent
-from hyrl_mj.envs.core import BatchedEnv
-from hyrl_mj.envs.sb3_env import TaskVecEnv
+from hyrl_mj.gym_export.core import BatchedEnv
+from hyrl_mj.gym_export.sb3_env import TaskVecEnv
 from hyrl_mj.learning.presets import preset
 from hyrl_mj.learning.training import build
 from hyrl_mj.policies.mlp import ACTIVATIONS, TORCH_NAMES, SampledPolicy

@@ -28,9 +28,9 @@ from test_agents import (
 
 import hyrl_mj
 from hyrl_mj import BadArtifact, load_agent
-from hyrl_mj.envs.core import BatchedEnv
-from hyrl_mj.envs.sb3_env import TaskVecEnv
 from hyrl_mj.files import artifacts
+from hyrl_mj.gym_export.core import BatchedEnv
+from hyrl_mj.gym_export.sb3_env import TaskVecEnv
 from hyrl_mj.policies import pickled, sb3_zip, torch_file
 
 

@@ -13,8 +13,8 @@ from trapped import HONEST, TRAPS
 
 import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, Noise, from_callable, simulate
-from hyrl_mj.envs.core import BatchedEnv
-from hyrl_mj.envs.sb3_env import TaskVecEnv
+from hyrl_mj.gym_export.core import BatchedEnv
+from hyrl_mj.gym_export.sb3_env import TaskVecEnv
 from hyrl_mj.judging.game import Answers, Lattice
 from hyrl_mj.policies import PolicyController, agent_at, memory_at_start
 from hyrl_mj.policies.external import read_agent

@@ -12,7 +12,7 @@ from sentences import assert_has_ended
 
 import hyrl_mj
 from hyrl_mj import BadInput
-from hyrl_mj.envs.core import BatchedEnv
+from hyrl_mj.gym_export.core import BatchedEnv
 from hyrl_mj.learning import training
 from hyrl_mj.learning.presets import preset
 from hyrl_mj.learning.settings import PRESETS

@@ -16,7 +16,7 @@ from sentences import assert_has_ended
 
 import hyrl_mj
 from hyrl_mj import Outcome
-from hyrl_mj.envs.core import BatchedEnv
+from hyrl_mj.gym_export.core import BatchedEnv
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.simulation import WayRuns, way_runs
 from hyrl_mj.tasks import registry
@@ -64,7 +64,7 @@ import numpy as np
 import hyrl_mj
 from hyrl_mj import Outcome
 from hyrl_mj.policies.controllers import PolicyController
-from hyrl_mj.envs.core import BatchedEnv
+from hyrl_mj.gym_export.core import BatchedEnv
 from hyrl_mj import Chart, Learning, Mirror, Outcome, Scene
 from hyrl_mj import mjcf
 

@@ -7,7 +7,7 @@ from planted import ChartPolicy
 
 import hyrl_mj
 from hyrl_mj import Outcome
-from hyrl_mj.envs import BatchedEnv, Domain
+from hyrl_mj.gym_export import BatchedEnv, Domain
 from hyrl_mj.judging.game import Lattice
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.simulation.rollout import LoopSettings, closed_loop

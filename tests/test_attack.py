@@ -36,7 +36,7 @@ OPENED = {
     ),
     "an environment without limits": (
         "^arguments", 58, "hangs",
-        "from hyrl_mj.environments.fresh import Fresh; Fresh.try_out = lambda *given: None",
+        "from hyrl_mj.gym_import.fresh import Fresh; Fresh.try_out = lambda *given: None",
     ),
     "modules in the current folder": (
         "^modules", 46, "was executed",
@@ -67,7 +67,7 @@ OPENED = {
         "^arguments", 81, "control characters",
         "import io\n"
         "from hyrl_mj import errors\n"
-        "from hyrl_mj.environments import making\n"
+        "from hyrl_mj.gym_import import making\n"
         "from hyrl_mj.sets import chart\n"
         "from hyrl_mj.system import streams\n"
         "chart.has_controls = lambda text: False\n"

@@ -10,7 +10,7 @@ from dm_control.mujoco.wrapper import core
 
 import hyrl_mj
 from hyrl_mj import BadInput, Outcome
-from hyrl_mj.envs import BatchedEnv
+from hyrl_mj.gym_export import BatchedEnv
 from hyrl_mj.physics import compiled, mjcf, mujoco_log
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.simulation import LoopSettings, closed_loop

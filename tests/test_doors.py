@@ -19,12 +19,12 @@ import pytest
 from attacks import doors, folders
 from command_line import call
 
-from hyrl_mj.environments import from_gymnasium, making
-from hyrl_mj.environments.making import from_spec
 from hyrl_mj.errors import BadInput
 from hyrl_mj.fields import read_field
 from hyrl_mj.fields.driving import Driving
 from hyrl_mj.files import trust
+from hyrl_mj.gym_import import from_gymnasium, making
+from hyrl_mj.gym_import.making import from_spec
 from hyrl_mj.physics import mjcf
 from hyrl_mj.policies import pickled
 from hyrl_mj.runs.sweeps import Common, Row, Setting, Sweep

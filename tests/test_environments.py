@@ -36,9 +36,9 @@ from planted import spare_environments, without_pdfs
 
 import hyrl_mj
 from hyrl_mj import BadInput, Outcome, from_gymnasium
-from hyrl_mj.environments import making
-from hyrl_mj.environments.coordinates import coordinates
-from hyrl_mj.environments.instance import Instance, flat
+from hyrl_mj.gym_import import making
+from hyrl_mj.gym_import.coordinates import coordinates
+from hyrl_mj.gym_import.instance import Instance, flat
 from hyrl_mj.learning import presets
 from hyrl_mj.physics.mjcf import camera_of, point_of, rests
 from hyrl_mj.physics.rendering import SceneRenderer

@@ -19,9 +19,9 @@ from stable_baselines3.common.env_checker import check_env as sb3_check
 
 import hyrl_mj
 from hyrl_mj import BadInput, Noise
-from hyrl_mj.envs.core import BatchedEnv, Domain
-from hyrl_mj.envs.gym_env import TaskEnv
-from hyrl_mj.envs.sb3_env import TaskVecEnv
+from hyrl_mj.gym_export.core import BatchedEnv, Domain
+from hyrl_mj.gym_export.gym_env import TaskEnv
+from hyrl_mj.gym_export.sb3_env import TaskVecEnv
 
 LEFT, AHEAD, RIGHT = 4, 2, 0
 IDS = {"unit_circle": "hyrl_mj/UnitCircle-v0", "vehicle": "hyrl_mj/ObstacleAvoidance-v0"}

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from hyrl_mj.environments.expressions import DEPTH, LENGTH, Expression, entry
 from hyrl_mj.errors import BadInput
+from hyrl_mj.gym_import.expressions import DEPTH, LENGTH, Expression, entry
 
 TERMINATED = np.array([False, True, False, True])
 TRUNCATED = np.array([False, False, True, True])

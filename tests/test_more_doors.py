@@ -20,13 +20,13 @@ from PIL import Image
 
 import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, from_gymnasium
-from hyrl_mj.environments import making
-from hyrl_mj.environments.making import explained
-from hyrl_mj.environments.opening import with_arrays
 from hyrl_mj.fields import read_field
 from hyrl_mj.files import artifacts, trust
 from hyrl_mj.files.manifest import Manifest, locked
 from hyrl_mj.files.sources import digest_of
+from hyrl_mj.gym_import import making
+from hyrl_mj.gym_import.making import explained
+from hyrl_mj.gym_import.opening import with_arrays
 from hyrl_mj.physics import mjcf
 from hyrl_mj.policies import algorithms
 from hyrl_mj.policies.preprocessing import Normalization

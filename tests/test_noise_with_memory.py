@@ -11,7 +11,7 @@ from planted import decisions, ideal_controller, sign_policy
 
 from hyrl_mj import BadInput, HybridArc, Noise, Run, Signal, cli, register_noise, simulate
 from hyrl_mj.cli import commands, parsing
-from hyrl_mj.envs.core import BatchedEnv
+from hyrl_mj.gym_export.core import BatchedEnv
 from hyrl_mj.judging.episodes import Regions, noisy_episodes
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.simulation.noise import _KINDS

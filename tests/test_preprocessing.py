@@ -15,9 +15,9 @@ from test_agents import OFF_POLICY, onnx_file, saved
 
 import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, Noise, load_agent, simulate
-from hyrl_mj.envs.core import BatchedEnv
-from hyrl_mj.envs.sb3_env import TaskVecEnv
-from hyrl_mj.envs.sb3_policy import Sb3Policy
+from hyrl_mj.gym_export.core import BatchedEnv
+from hyrl_mj.gym_export.sb3_env import TaskVecEnv
+from hyrl_mj.gym_export.sb3_policy import Sb3Policy
 from hyrl_mj.policies import (
     MlpPolicy,
     PolicyController,

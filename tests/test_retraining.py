@@ -14,8 +14,8 @@ from planted import (
 )
 
 from hyrl_mj import closed_loop
-from hyrl_mj.envs import BatchedEnv
-from hyrl_mj.envs.core import cautious_reward
+from hyrl_mj.gym_export import BatchedEnv
+from hyrl_mj.gym_export.core import cautious_reward
 from hyrl_mj.judging.game import Game
 from hyrl_mj.judging.results import ModeResult
 from hyrl_mj.learning import ModeSettings, symmetry, training

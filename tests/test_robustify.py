@@ -19,9 +19,9 @@ from test_agents import onnx_file, rewritten, saved, untrained
 
 import hyrl_mj
 from hyrl_mj import BadInput, MlpPolicy
-from hyrl_mj.envs.core import BatchedEnv
-from hyrl_mj.envs.sb3_env import TaskVecEnv
 from hyrl_mj.files import artifacts, manifest
+from hyrl_mj.gym_export.core import BatchedEnv
+from hyrl_mj.gym_export.sb3_env import TaskVecEnv
 from hyrl_mj.judging.game.lattice import Lattice
 from hyrl_mj.judging.game.limit import Limit
 from hyrl_mj.learning import training

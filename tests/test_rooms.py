@@ -76,7 +76,7 @@ controller = hyrl_mj.HybridController(policy.task, {{0: policy}}, {{0: Everythin
 arc = hyrl_mj.simulate(policy.task, controller, policy.task.scene.starts[0], horizon=0.5)
 assert len(arc.t) == 11
 
-from hyrl_mj.envs.sb3_policy import Sb3Policy
+from hyrl_mj.gym_export.sb3_policy import Sb3Policy
 
 measured = policy.task.chart.check(policy.task.scene.starts, policy.task.name)
 actions, (q,) = Sb3Policy(policy.task, controller).predict(policy.task.observation(measured))

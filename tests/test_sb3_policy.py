@@ -15,10 +15,10 @@ from planted import (
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from hyrl_mj import BadInput, LoopSettings, Noise, closed_loop
-from hyrl_mj.envs.core import BatchedEnv
-from hyrl_mj.envs.gym_env import action_space
-from hyrl_mj.envs.sb3_env import TaskVecEnv
-from hyrl_mj.envs.sb3_policy import Sb3Policy
+from hyrl_mj.gym_export.core import BatchedEnv
+from hyrl_mj.gym_export.gym_env import action_space
+from hyrl_mj.gym_export.sb3_env import TaskVecEnv
+from hyrl_mj.gym_export.sb3_policy import Sb3Policy
 from hyrl_mj.policies.controllers import as_controller
 
 QUIET, ALTERNATING, UNIFORM = Noise(), Noise("alternating", 0.1), Noise("uniform", 0.1)

@@ -9,7 +9,7 @@ from planted import random_states
 
 import hyrl_mj
 from hyrl_mj import BadInput, Learning, Outcome, Scene
-from hyrl_mj.envs import BatchedEnv
+from hyrl_mj.gym_export import BatchedEnv
 from hyrl_mj.learning import preset
 from hyrl_mj.tasks.unit_circle import UnitCircle
 

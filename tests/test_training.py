@@ -14,7 +14,7 @@ from planted import spare
 
 import hyrl_mj
 from hyrl_mj import BadInput, MlpPolicy, Noise
-from hyrl_mj.envs.core import BatchedEnv
+from hyrl_mj.gym_export.core import BatchedEnv
 from hyrl_mj.learning import training
 from hyrl_mj.learning.presets import preset
 

@@ -17,8 +17,8 @@ from gymnasium import spaces
 from gymnasium.wrappers import FlattenObservation, TimeLimit
 
 from hyrl_mj import BadInput, from_callable, from_gymnasium, get_task, simulate
-from hyrl_mj.environments import making
-from hyrl_mj.environments.fingerprint import Unknown, fingerprint
+from hyrl_mj.gym_import import making
+from hyrl_mj.gym_import.fingerprint import Unknown, fingerprint
 from hyrl_mj.simulation import Recorded
 
 pytestmark = pytest.mark.slow  # a second for each environment

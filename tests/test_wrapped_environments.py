@@ -16,8 +16,8 @@ from stable_baselines3.sac.policies import SACPolicy
 from test_truer_environments import STARTS, flat, outcomes, pilot, plain
 
 from hyrl_mj import BadInput, from_callable, from_gymnasium, load_agent, simulate
-from hyrl_mj.envs import BatchedEnv
-from hyrl_mj.envs.sb3_env import TaskVecEnv
+from hyrl_mj.gym_export import BatchedEnv
+from hyrl_mj.gym_export.sb3_env import TaskVecEnv
 from hyrl_mj.tasks import check_task, trial
 
 pytestmark = pytest.mark.slow  # a second for each environment

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from stable_baselines3 import A2C, DQN, PPO, SAC, TD3
 
-from hyrl_mj.envs.core import BatchedEnv
-from hyrl_mj.envs.sb3_env import TaskVecEnv
+from hyrl_mj.gym_export.core import BatchedEnv
+from hyrl_mj.gym_export.sb3_env import TaskVecEnv
 
 # ---- honest agents: functions from observations (n, k) to inputs (n, m), or to levels (n,)
 

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from hyrl_mj import pipeline
-from hyrl_mj.environments import EnvironmentOptions, chosen_task, explained
 from hyrl_mj.errors import BadInput, printable, unknown
 from hyrl_mj.fields import DriveOptions, exported_controller
 from hyrl_mj.files import trust
+from hyrl_mj.gym_import import EnvironmentOptions, chosen_task, explained
 from hyrl_mj.judging import Word
 from hyrl_mj.pipeline import AgentOptions, ExamineOptions, RunOptions, SweepOptions
 from hyrl_mj.policies import AnyPolicy, agent_at

@@ -16,9 +16,9 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from threadpoolctl import threadpool_limits
 from torch import nn
 
-from hyrl_mj.envs import BatchedEnv, Domain
-from hyrl_mj.envs.sb3_env import TaskVecEnv
 from hyrl_mj.errors import BadInput, HyrlError, brief
+from hyrl_mj.gym_export import BatchedEnv, Domain
+from hyrl_mj.gym_export.sb3_env import TaskVecEnv
 from hyrl_mj.learning import symmetry
 from hyrl_mj.learning.rehearsal import Rehearsal
 from hyrl_mj.learning.settings import Training

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hyrl_mj.envs import Domain
+from hyrl_mj.gym_export import Domain
 from hyrl_mj.judging import game
 from hyrl_mj.learning import ModeSettings
 from hyrl_mj.learning.training import Score

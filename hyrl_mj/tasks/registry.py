@@ -53,8 +53,8 @@ def register(task: type[Task]) -> type[Task]:
     _REGISTRY[task.name] = task
     gym.register(
         id=task.env_id,
-        entry_point="hyrl_mj.envs.gym_env:TaskEnv",
-        vector_entry_point="hyrl_mj.envs.gym_env:TaskVectorEnv",
+        entry_point="hyrl_mj.gym_export.gym_env:TaskEnv",
+        vector_entry_point="hyrl_mj.gym_export.gym_env:TaskVectorEnv",
         kwargs={"task": task.name},
         max_episode_steps=getattr(task, "max_steps", None),  # `check_task` says what is missing
     )
@@ -78,7 +78,7 @@ def get_task(name: str | Path | Task) -> Task:
     if isinstance(name, Task):
         return name
     if str(name).startswith(ENVIRONMENT):
-        maker = importlib.import_module("hyrl_mj.environments.making")  # it lies above
+        maker = importlib.import_module("hyrl_mj.gym_import.making")  # it lies above
         made: Task = maker.from_spec(str(name))
         return made
     if str(name).endswith(".py"):

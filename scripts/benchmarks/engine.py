@@ -13,7 +13,7 @@ import hyrl_mj
 from benchmarks import Figure
 from benchmarks.runs import Runs
 from hyrl_mj import Chart, Outcome, Task
-from hyrl_mj.envs import BatchedEnv
+from hyrl_mj.gym_export import BatchedEnv
 from hyrl_mj.simulation import LoopSettings, Noise, closed_loop
 
 # Samples that a piece of work is.

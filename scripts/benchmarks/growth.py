@@ -34,7 +34,7 @@ def measure(kind: str, size: int, run: Path) -> tuple[float, float]:
 
     task = hyrl_mj.get_task("vehicle")
     if kind == "simulations":
-        from hyrl_mj.envs import BatchedEnv
+        from hyrl_mj.gym_export import BatchedEnv
 
         env = BatchedEnv(task, size)
         env.seed(0)

@@ -22,7 +22,7 @@ import hyrl_mj.viz.drives as drives
 import hyrl_mj.viz.figures.style as style
 import hyrl_mj.viz.replay as replay
 from hyrl_mj import cli
-from hyrl_mj.environments.task import EnvironmentTask
+from hyrl_mj.gym_import.task import EnvironmentTask
 from hyrl_mj.learning import presets
 from hyrl_mj.system import limits
 from hyrl_mj.tasks import Task

@@ -11,16 +11,16 @@ from typing import Any, Self
 import mujoco
 import numpy as np
 
-from hyrl_mj.environments.fingerprint import of_model
-from hyrl_mj.environments.instance import Instance
-from hyrl_mj.environments.observations import parts_of
-from hyrl_mj.environments.opening import code_of
-from hyrl_mj.environments.plant import EnvironmentPlant
-from hyrl_mj.environments.pool import Pool
-from hyrl_mj.environments.specification import EnvironmentSpec
-from hyrl_mj.environments.stage import Played
-from hyrl_mj.environments.trials import goes_on
 from hyrl_mj.errors import BadInput
+from hyrl_mj.gym_import.fingerprint import of_model
+from hyrl_mj.gym_import.instance import Instance
+from hyrl_mj.gym_import.observations import parts_of
+from hyrl_mj.gym_import.opening import code_of
+from hyrl_mj.gym_import.plant import EnvironmentPlant
+from hyrl_mj.gym_import.pool import Pool
+from hyrl_mj.gym_import.specification import EnvironmentSpec
+from hyrl_mj.gym_import.stage import Played
+from hyrl_mj.gym_import.trials import goes_on
 from hyrl_mj.physics import mjcf
 from hyrl_mj.tasks import ANY, SPARING, Abilities, Learning, Outcome, Scene, Task, get_task
 

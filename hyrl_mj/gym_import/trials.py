@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from hyrl_mj.environments.fingerprint import differing
-from hyrl_mj.environments.instance import Instance
-from hyrl_mj.environments.observations import flat, observers
-from hyrl_mj.environments.plant import EnvironmentPlant
-from hyrl_mj.environments.pool import Pool
-from hyrl_mj.environments.specification import Derived, EnvironmentSpec
-from hyrl_mj.environments.stage import Played
 from hyrl_mj.errors import BadInput
+from hyrl_mj.gym_import.fingerprint import differing
+from hyrl_mj.gym_import.instance import Instance
+from hyrl_mj.gym_import.observations import flat, observers
+from hyrl_mj.gym_import.plant import EnvironmentPlant
+from hyrl_mj.gym_import.pool import Pool
+from hyrl_mj.gym_import.specification import Derived, EnvironmentSpec
+from hyrl_mj.gym_import.stage import Played
 
 # Episodes and samples of a trial, and for how many samples inputs are held.
 EPISODES, SAMPLES, HELD = 8, 40, 8

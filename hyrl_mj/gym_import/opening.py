@@ -21,10 +21,10 @@ import mujoco
 import numpy as np
 from gymnasium import spaces
 
-from hyrl_mj.environments.observations import parts_of
 from hyrl_mj.errors import BadInput, brief, check_seed
 from hyrl_mj.files.artifacts import digest
 from hyrl_mj.files.trust import current_folder
+from hyrl_mj.gym_import.observations import parts_of
 from hyrl_mj.physics import mjcf, mujoco_log
 from hyrl_mj.ranges import Integer, OneOf, Optional, refused
 

@@ -16,7 +16,7 @@ import numpy as np
 from hyrl_mj.errors import BadInput, brief
 
 if TYPE_CHECKING:
-    from hyrl_mj.environments.instance import Instance
+    from hyrl_mj.gym_import.instance import Instance
 
 
 class Chain:

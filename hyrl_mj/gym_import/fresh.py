@@ -20,10 +20,10 @@ from multiprocessing.reduction import recv_handle, send_handle
 from threading import Lock
 from typing import Any
 
-from hyrl_mj.environments.opening import Description, preload
-from hyrl_mj.environments.specification import EnvironmentSpec
-from hyrl_mj.environments.stage import Stage
 from hyrl_mj.errors import BadInput, HyrlError, brief
+from hyrl_mj.gym_import.opening import Description, preload
+from hyrl_mj.gym_import.specification import EnvironmentSpec
+from hyrl_mj.gym_import.stage import Stage
 from hyrl_mj.system import limits
 from hyrl_mj.system.forked import own_end
 

@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from hyrl_mj.environments.fresh import Fresh, ended, received
-from hyrl_mj.environments.specification import EnvironmentSpec
-from hyrl_mj.environments.stage import Arrays, Played, Stage
+from hyrl_mj.gym_import.fresh import Fresh, ended, received
+from hyrl_mj.gym_import.specification import EnvironmentSpec
+from hyrl_mj.gym_import.stage import Arrays, Played, Stage
 from hyrl_mj.system import cores
 from hyrl_mj.system.generators import kept_generators
 

@@ -11,8 +11,8 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from hyrl_mj.envs.core import BatchedEnv
 from hyrl_mj.errors import BadInput, unknown
+from hyrl_mj.gym_export.core import BatchedEnv
 from hyrl_mj.physics import mjcf
 from hyrl_mj.simulation import AnyNoise
 from hyrl_mj.tasks import Outcome, Task, described_task

@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hyrl_mj.environments.fingerprint import DEEPEST, FUNCTIONS, differing, has_no_memory
-from hyrl_mj.environments.instance import Instance
-from hyrl_mj.environments.specification import EnvironmentSpec
-from hyrl_mj.environments.trials import EPISODES, HELD, PLACES, SAMPLES
 from hyrl_mj.errors import BadInput
+from hyrl_mj.gym_import.fingerprint import DEEPEST, FUNCTIONS, differing, has_no_memory
+from hyrl_mj.gym_import.instance import Instance
+from hyrl_mj.gym_import.specification import EnvironmentSpec
+from hyrl_mj.gym_import.trials import EPISODES, HELD, PLACES, SAMPLES
 
 # What changes by this share of a displacement follows the place [share].
 FOLLOWS = 0.01

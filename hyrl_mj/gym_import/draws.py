@@ -6,10 +6,10 @@ import json
 
 import numpy as np
 
-from hyrl_mj.environments.coordinates import robot_of
-from hyrl_mj.environments.fingerprint import Fingerprint, differing
-from hyrl_mj.environments.instance import Instance
 from hyrl_mj.errors import BadInput
+from hyrl_mj.gym_import.coordinates import robot_of
+from hyrl_mj.gym_import.fingerprint import Fingerprint, differing
+from hyrl_mj.gym_import.instance import Instance
 
 # Resets that are compared for all that they draw.
 COMPARED = 4

@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from hyrl_mj.environments import fingerprint as written
-from hyrl_mj.environments.instance import Instance
-from hyrl_mj.environments.specification import EnvironmentSpec
 from hyrl_mj.errors import BadInput
 from hyrl_mj.files import trust
+from hyrl_mj.gym_import import fingerprint as written
+from hyrl_mj.gym_import.instance import Instance
+from hyrl_mj.gym_import.specification import EnvironmentSpec
 from hyrl_mj.system import limits
 from hyrl_mj.tasks import Outcome
 

@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from hyrl_mj.environments.instance import Instance
-from hyrl_mj.environments.observations import columns_of
-from hyrl_mj.environments.opening import AnyChart
-from hyrl_mj.environments.specification import Coordinate
 from hyrl_mj.errors import BadInput, unknown
+from hyrl_mj.gym_import.instance import Instance
+from hyrl_mj.gym_import.observations import columns_of
+from hyrl_mj.gym_import.opening import AnyChart
+from hyrl_mj.gym_import.specification import Coordinate
 from hyrl_mj.physics import mjcf
 from hyrl_mj.tasks import touching
 

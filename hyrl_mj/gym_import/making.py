@@ -19,16 +19,16 @@ from weakref import WeakSet, WeakValueDictionary
 import gymnasium as gym
 import numpy as np
 
-from hyrl_mj.environments.inspection import inspect
-from hyrl_mj.environments.opening import (
+from hyrl_mj.errors import BadInput, brief, described, printable, unknown
+from hyrl_mj.files import artifacts, trust
+from hyrl_mj.gym_import.inspection import inspect
+from hyrl_mj.gym_import.opening import (
     AnyChart,
     Description,
     register,
     with_arrays,
 )
-from hyrl_mj.environments.task import EnvironmentTask
-from hyrl_mj.errors import BadInput, brief, described, printable, unknown
-from hyrl_mj.files import artifacts, trust
+from hyrl_mj.gym_import.task import EnvironmentTask
 from hyrl_mj.system.generators import kept_generators
 from hyrl_mj.tasks import ENVIRONMENT, Task, get_task
 

@@ -8,9 +8,9 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
-from hyrl_mj.envs.core import BatchedEnv
-from hyrl_mj.envs.gym_env import action_space, check_options, observation_space, starts
 from hyrl_mj.errors import BadInput
+from hyrl_mj.gym_export.core import BatchedEnv
+from hyrl_mj.gym_export.gym_env import action_space, check_options, observation_space, starts
 from hyrl_mj.tasks import Outcome
 
 

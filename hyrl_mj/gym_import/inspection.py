@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from hyrl_mj.environments import trials
-from hyrl_mj.environments.coordinates import (
+from hyrl_mj.errors import BadInput
+from hyrl_mj.files import trust
+from hyrl_mj.gym_import import trials
+from hyrl_mj.gym_import.coordinates import (
     all_names,
     bounds_of,
     coordinates,
@@ -19,22 +21,20 @@ from hyrl_mj.environments.coordinates import (
     islands_of,
     robot_of,
 )
-from hyrl_mj.environments.draws import check_draws, states_of_resets
-from hyrl_mj.environments.expressions import Expression
-from hyrl_mj.environments.fingerprint import codes_of, differing, is_known
-from hyrl_mj.environments.fresh import Fresh
-from hyrl_mj.environments.instance import Instance
-from hyrl_mj.environments.observations import parts_of
-from hyrl_mj.environments.opening import FORMS, AnyChart, Description, layers
-from hyrl_mj.environments.pool import Pool
-from hyrl_mj.environments.specification import (
+from hyrl_mj.gym_import.draws import check_draws, states_of_resets
+from hyrl_mj.gym_import.expressions import Expression
+from hyrl_mj.gym_import.fingerprint import codes_of, differing, is_known
+from hyrl_mj.gym_import.fresh import Fresh
+from hyrl_mj.gym_import.instance import Instance
+from hyrl_mj.gym_import.observations import parts_of
+from hyrl_mj.gym_import.opening import FORMS, AnyChart, Description, layers
+from hyrl_mj.gym_import.pool import Pool
+from hyrl_mj.gym_import.specification import (
     Criterion,
     EnvironmentSpec,
 )
-from hyrl_mj.environments.uses import check_noted, check_use
-from hyrl_mj.environments.wrappers import changes_by_reset, check_told, senses
-from hyrl_mj.errors import BadInput
-from hyrl_mj.files import trust
+from hyrl_mj.gym_import.uses import check_noted, check_use
+from hyrl_mj.gym_import.wrappers import changes_by_reset, check_told, senses
 from hyrl_mj.physics import mjcf
 from hyrl_mj.sets import Chart
 

@@ -18,14 +18,14 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from hyrl_mj.environments import fingerprint as written
-from hyrl_mj.environments.chain import Chain
-from hyrl_mj.environments.expressions import entry
-from hyrl_mj.environments.observations import flat, observers, shaped
-from hyrl_mj.environments.opening import checked_step, made, peeled, physics_of, steps_of
-from hyrl_mj.environments.physics import Physics, set_pins
-from hyrl_mj.environments.specification import Derived, EnvironmentSpec
 from hyrl_mj.errors import BadInput, HyrlError, brief
+from hyrl_mj.gym_import import fingerprint as written
+from hyrl_mj.gym_import.chain import Chain
+from hyrl_mj.gym_import.expressions import entry
+from hyrl_mj.gym_import.observations import flat, observers, shaped
+from hyrl_mj.gym_import.opening import checked_step, made, peeled, physics_of, steps_of
+from hyrl_mj.gym_import.physics import Physics, set_pins
+from hyrl_mj.gym_import.specification import Derived, EnvironmentSpec
 from hyrl_mj.system.generators import global_state
 
 

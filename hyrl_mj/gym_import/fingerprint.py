@@ -23,8 +23,8 @@ import mujoco
 import numpy as np
 from gymnasium import spaces
 
-from hyrl_mj.environments.opening import layers
-from hyrl_mj.environments.physics import STATE
+from hyrl_mj.gym_import.opening import layers
+from hyrl_mj.gym_import.physics import STATE
 
 # Objects of these modules hold no memory of an environment, or it is in MuJoCo's state.
 PASSED = (

@@ -10,12 +10,12 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from hyrl_mj.environments.fingerprint import differing
-from hyrl_mj.environments.instance import Instance
-from hyrl_mj.environments.observations import flat
-from hyrl_mj.environments.specification import EnvironmentSpec
-from hyrl_mj.environments.trials import EPISODES, HELD, SAMPLES
 from hyrl_mj.errors import BadInput
+from hyrl_mj.gym_import.fingerprint import differing
+from hyrl_mj.gym_import.instance import Instance
+from hyrl_mj.gym_import.observations import flat
+from hyrl_mj.gym_import.specification import EnvironmentSpec
+from hyrl_mj.gym_import.trials import EPISODES, HELD, SAMPLES
 
 
 class _Sensor:

@@ -3,9 +3,9 @@
 The module `sb3_env` imports Stable-Baselines3, so it is imported only where it is needed.
 """
 
-from hyrl_mj.envs.core import BatchedEnv, Domain
-from hyrl_mj.envs.gym_env import TaskEnv, TaskVectorEnv, observation_space
-from hyrl_mj.envs.sb3_policy import Sb3Policy
+from hyrl_mj.gym_export.core import BatchedEnv, Domain
+from hyrl_mj.gym_export.gym_env import TaskEnv, TaskVectorEnv, observation_space
+from hyrl_mj.gym_export.sb3_policy import Sb3Policy
 
 __all__ = [
     "BatchedEnv",

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from hyrl_mj.environments.pool import Pool
-from hyrl_mj.environments.specification import EnvironmentSpec
 from hyrl_mj.errors import BadInput
+from hyrl_mj.gym_import.pool import Pool
+from hyrl_mj.gym_import.specification import EnvironmentSpec
 from hyrl_mj.physics import mjcf
 from hyrl_mj.physics.plant import MOST, checked, checked_inputs
 from hyrl_mj.ranges import Integer

@@ -10,9 +10,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from hyrl_mj.environments.expressions import Expression, Path
-from hyrl_mj.environments.opening import Description
 from hyrl_mj.errors import BadInput
+from hyrl_mj.gym_import.expressions import Expression, Path
+from hyrl_mj.gym_import.opening import Description
 from hyrl_mj.sets import Chart
 from hyrl_mj.tasks import Outcome
 
