@@ -39,7 +39,7 @@ OPENED = {
         "from hyrl_mj.gym_import.fresh import Fresh; Fresh.try_out = lambda *given: None",
     ),
     "modules in the current folder": (
-        "^modules", 46, "was executed",
+        "^modules", 46, "was executed|has no attribute",
         "from attacks import folders\n"
         "folders.PROGRAM = f'import sys; sys.path.insert(0, \"\"); {folders.PROGRAM}'",
     ),
@@ -47,21 +47,19 @@ OPENED = {
         "^agent", 64, "hangs",
         "import inspect\n"
         "from hyrl_mj.policies import pickled\n"
-        "source = inspect.getsource(pickled.arrays).replace('{name:', '{str(name):')\n"
+        "source = inspect.getsource(pickled.entries).replace('{name:', '{str(name):')\n"
         "exec(source.replace(' if isinstance(name, str)', ''), vars(pickled))",
     ),
     "a name that doubles itself": (
         "^agent", 41, "MB more", "from hyrl_mj.policies import pickled; pickled.LONGEST = 10**12",
     ),
     "keys that are there twice": (
-        "^field", 61, "hangs",
+        "^field", 61, "hangs|to be refused",
         "from hyrl_mj.fields import files\n"
-        "def once(pairs):\n"
-        "    names = [name for name, _ in pairs]\n"
-        "    if twice := [name for name in names if names.count(name) > 1]:\n"
-        "        raise files._Repeated(twice[0])\n"
-        "    return dict(pairs)\n"
-        "files._once = once",
+        "def counts(names):\n"
+        "    names = list(names)\n"
+        "    return {name: names.count(name) for name in names}\n"
+        "files.Counter = counts",
     ),
     "a name that controls the terminal": (
         "^arguments", 81, "control characters",
