@@ -85,12 +85,12 @@ class Parts(FocusController):
 
 def rows_of(run: hyrl_mj.Run, task: Driving, seed: int) -> dict[str, Controller]:
     """Returns the controllers by what they are made of."""
-    noise, trained = run.settings.noise, run.mode_policies
+    eps, trained = run.settings.eps, run.mode_policies
     law: Mapping = {side: TangentLaw(task.local, side) for side in (LEFT, RIGHT)}
     drawing: Mapping = dict.fromkeys((LEFT, RIGHT), Random(seed))
 
     def parts(policies: Mapping, memory: bool, guarded: bool) -> Parts:
-        return Parts(task, policies, noise, remembers=memory, guarded=guarded)
+        return Parts(task, policies, eps, remembers=memory, guarded=guarded)
 
     return {
         "policy of stage 1 alone": PolicyController(WithoutMemory(task, run.policy)),

@@ -226,7 +226,7 @@ def free(layouts: Layouts, i: int, place: np.ndarray, room: float) -> bool:
 
 
 def loops_of(run: hyrl_mj.Run, task: Driving) -> dict[str, Controller]:
-    return controllers(task, run.policy, run.mode_policies, run.settings.noise)
+    return controllers(task, run.policy, run.mode_policies, run.settings.eps)
 
 
 def try_published(run: hyrl_mj.Run, path: Path, rounds: int, table: Table) -> None:

@@ -83,7 +83,7 @@ def equal_returns(run: hyrl_mj.Run) -> np.ndarray:
 
 def measure(run: hyrl_mj.Run, count: int) -> dict[str, str]:
     """Returns the figures of a run by heading."""
-    task, eps, points = run.task, run.settings.noise, run.critical_set.points
+    task, eps, points = run.task, run.settings.eps, run.critical_set.points
     modes = ", ".join(task.mode_name(q) for q in run.controller.modes)
     row = {
         "run": run.path.name,

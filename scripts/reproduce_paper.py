@@ -64,7 +64,7 @@ def opened(path: Path, task: str) -> hyrl_mj.Run:
         s = hyrl_mj.load_run(path).settings
         if s.task != task:
             raise BadInput(f"{path} is a run of {s.task}: give one of {task}")
-        options = replace(options, eps=s.noise, seed=s.seed, preset=s.preset, horizon=s.horizon)
+        options = replace(options, eps=s.eps, seed=s.seed, preset=s.preset, horizon=s.horizon)
     run = hyrl_mj.run(task, options, say=lambda text: print(f"{path}: {text}"))
     if len(run.extended_sets.modes) < 2 or not len(run.critical_set.points):
         raise BadInput(f"{path} has no critical set to show: give a run with another seed")
@@ -131,7 +131,7 @@ def common(run: hyrl_mj.Run, horizon: str, width: str, least: float) -> Iterator
     """Lines for both problems; the paper's overlap is at least `least` wide."""
     unit = run.task.chart.units[0]
     sets, sized = run.extended_sets, run.settings.horizon is None
-    yield "noise bound eps", f"0.1 {unit}", f"{run.settings.noise:g} {unit}", ""
+    yield "noise bound eps", f"0.1 {unit}", f"{run.settings.eps:g} {unit}", ""
     yield "horizon T (step 5)", horizon, f"{sets.horizon:.3g} s", SIZED if sized else ""
     at = np.linalg.norm(run.critical_set.points - run.arcs()["critical", "policy"].z[0], axis=1)
     here, narrowest = overlap(run)[at.argmin()], overlap(run).min()
@@ -144,7 +144,7 @@ def common(run: hyrl_mj.Run, horizon: str, width: str, least: float) -> Iterator
 def policy_alone(run: hyrl_mj.Run, paper_fates: tuple[str, ...]) -> Iterator[Line]:
     """Lines for the stage-1 policy from the starts of Section III; `paper_fates` is what the paper says."""
     s = run.settings
-    arcs = policy_start_arcs(run.task, run.policy, s.noise, s.seed)
+    arcs = policy_start_arcs(run.task, run.policy, s.eps, s.seed)
     for paper, arc in zip(paper_fates, arcs, strict=True):
         yield f"{s.stage1.title} from {point(arc.z[0])}", paper, fate(run, arc), ""
 

@@ -82,7 +82,7 @@ def reached(task: hyrl_mj.Task, loop: Controller, z: np.ndarray) -> np.ndarray:
 def measure(made: Row, count: int, folder: Path) -> list[str]:
     """Returns one row of the table; figures that miss their target end in "!"."""
     run = hyrl_mj.load_run(folder / made.name)
-    noises = tuple(hyrl_mj.Noise(kind, run.settings.noise) for kind in KINDS)
+    noises = tuple(hyrl_mj.Noise(kind, run.settings.eps) for kind in KINDS)
     row = [made.setting.task, str(made.seed)]
     for loop, controller in run.loops.items():
         n = min(count, SHARE) if loop == "policy" else count

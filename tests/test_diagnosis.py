@@ -78,7 +78,7 @@ def test_without_noise_the_same_start_is_won(run, worst):
 
 
 def test_without_noise_nothing_is_lost(run):
-    quiet = replace(run, settings=replace(run.settings, noise=0.0))
+    quiet = replace(run, settings=replace(run.settings, eps=0.0))
     # Its files were made with other settings, so they are not read again.
     results = ("policy", "critical_set", "partition")
     vars(quiet).update({name: getattr(run, name) for name in results})

@@ -278,7 +278,7 @@ def planted():
         task=task,
         policy=policy,
         policy_title="RL policy (PPO)",
-        settings=SimpleNamespace(noise=0.1, attack=AttackSettings()),
+        settings=SimpleNamespace(eps=0.1, attack=AttackSettings()),
         mode_networks={side: Steering(task, side) for side in (LEFT, RIGHT)},
     )
 

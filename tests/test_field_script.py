@@ -83,7 +83,7 @@ def test_the_rows_lack_what_their_names_say(script, monkeypatch):
     task = hyrl_mj.get_task("field")
     layouts = script["drawn"](np.random.default_rng(0), 4, 2, moving=False)
     ahead = SimpleNamespace(inputs=lambda observed: np.tile([1.0, 0.0], (len(observed), 1)))
-    settings, policies = SimpleNamespace(noise=0.1), dict.fromkeys((LEFT, RIGHT), ahead)
+    settings, policies = SimpleNamespace(eps=0.1), dict.fromkeys((LEFT, RIGHT), ahead)
     run = SimpleNamespace(settings=settings, policy=ahead, mode_policies=policies)
     loops = rows_of(run, Driving(task, layouts), seed=0)
     # 0.15 m in front of the first post of the first field, with the face to it.

@@ -213,7 +213,7 @@ def test_the_guard_keeps_robots_off_posts_whatever_the_noise(field):
         given = Noise(kind, noise) if kind != "bias" else away_from(task, z, places, noise)
         run = closed_loop(task, controller, z, given, settings=settings)
         assert not (run.outcome == Outcome.CRASHED).any()
-    free = replace(controller, noise=-10.0)
+    free = replace(controller, eps=-10.0)
     run = closed_loop(task, free, z, None, settings=LoopSettings(quiet=True))
     assert (run.outcome == Outcome.CRASHED).sum() > n / 8
 
@@ -227,7 +227,7 @@ def away_from(task, z, places, noise):
 
 
 def guard(noise=0.1):
-    return Guard(body=0.1, noise=noise, low=-1.0, high=1.0, rate=1.0)
+    return Guard(body=0.1, eps=noise, low=-1.0, high=1.0, rate=1.0)
 
 
 def guarded(pose, posts, u, turn, sense=1, goal=(5.0, 0.0), noise=0.1):

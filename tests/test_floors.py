@@ -40,7 +40,7 @@ def cuts(gate):
 @pytest.fixture(scope="module")
 def found(gate, cuts):
     """M* of the expert in each section."""
-    settings = SimpleNamespace(rods=12, resolution=1 / 16, noise=0.0, ways=WaySettings())
+    settings = SimpleNamespace(rods=12, resolution=1 / 16, eps=0.0, ways=WaySettings())
     run = SimpleNamespace(
         task=gate,
         steady=expert(gate),

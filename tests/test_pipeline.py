@@ -171,12 +171,12 @@ def test_a_horizon_that_cannot_be_used_changes_nothing(run):
 
 def test_a_run_made_for_noise_on_all_coordinates_is_examined_so(vehicle, tmp_path, monkeypatch):
     path = tmp_path / "run"
-    plant(path, vehicle, decisions(vehicle), halves(vehicle, 60), noise=0.05, everywhere=True)
+    plant(path, vehicle, decisions(vehicle), halves(vehicle, 60), eps=0.05, everywhere=True)
     run = hyrl_mj.load_run(path)
     assert run.task.noisy == (True, True)
     assert hyrl_mj.get_task("vehicle").noisy == (False, True)
     sets = run_stage(run, "extended-sets", lambda text: None).extended_sets
-    assert sets.noise == 0.05
+    assert sets.eps == 0.05
     robustness = examine_run(run, say=lambda text: None)
     assert robustness.everywhere
     assert run.is_examined_as_usual

@@ -322,7 +322,7 @@ def test_settings_versions_and_the_command_are_told(finished):
     assert rows == config["versions"]
     rows = dict(tuple(row) for row in page.tables["Settings"])
     assert rows["seed"] == "0"
-    assert rows["noise"] == f"0.1 {run.task.chart.units[0]}"
+    assert rows["eps"] == f"0.1 {run.task.chart.units[0]}"
     training = {name: cells for name, *cells in page.tables["Training"]}
     stages = (run.settings.stage1, run.settings.stage6)
     assert training["gamma"] == [str(stage.gamma) for stage in stages]
@@ -333,7 +333,7 @@ def test_settings_versions_and_the_command_are_told(finished):
 
 def test_the_command_tells_what_is_not_the_default(copied):
     run = load_run(copied)
-    settings = replace(run.settings, noise=0.05, seed=7, horizon=0.4)
+    settings = replace(run.settings, eps=0.05, seed=7, horizon=0.4)
     changed = Run(copied, settings)
     write_config(changed)
     believe(copied)
@@ -356,7 +356,7 @@ def test_the_command_tells_what_is_not_the_default(copied):
 def test_what_the_command_does_not_repeat_is_named(copied):
     agent = Agent("onnx", "agent.onnx", "0" * 64)
     run = load_run(copied)
-    given = preset(run.task, "smoke", noise=0.1, agent=agent)
+    given = preset(run.task, "smoke", eps=0.1, agent=agent)
     assert changed_settings(Run(copied, given)) == []
     assert changed_settings(Run(copied, replace(given, cells=99))) == ["cells"]
 

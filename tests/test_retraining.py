@@ -119,7 +119,7 @@ def test_only_in_its_part_does_a_mode_earn_the_reward_of_the_task(circle):
 def test_the_modes_of_the_circle_settle_as_early_as_can_be_at_any_noise(circle, eps):
     # No controller settles within 0.3 rad of the set-point under greater noise than that.
     parts, sets = circle_sets(circle, eps, cells=2880)
-    settings = preset(circle, "fast", noise=eps).stage6
+    settings = preset(circle, "fast", eps=eps).stage6
     first, result = retrain(mode_ground(circle, sets, 0, parts), settings, seed=1)
     second, _ = retrain(
         mode_ground(circle, sets, 1, parts), settings, seed=1, others=[(first, result)]
@@ -322,7 +322,7 @@ def test_the_judge_s_noise_never_hides_the_chart(puck, puck_sets):
     share = puck.noise_in_chart(1.0)[1]
     limit = puck.chart.sides[1] / (2 * share)
     for noise in (0.1, 0.95 * limit):
-        ground = by_episodes(puck, replace(puck_sets, noise=noise), 0)
+        ground = by_episodes(puck, replace(puck_sets, eps=noise), 0)
         assert noise < puck.check_noise(ground.noise.bound) <= 1.2 * noise + 1e-12
 
 

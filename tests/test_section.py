@@ -66,7 +66,7 @@ def test_a_ball_becomes_a_disc(section, ball):
 def test_its_critical_set_is_searched_for_in_the_plane(cube, section, monkeypatch):
     policy = sphere_policy(cube, RADIUS)
     whole = find_critical_set(cube, policy, 8, 1 / 4)
-    settings = SimpleNamespace(rods=20, resolution=1 / 16, noise=0.1, ways=WaySettings())
+    settings = SimpleNamespace(rods=20, resolution=1 / 16, eps=0.1, ways=WaySettings())
     run = SimpleNamespace(critical_set=whole, steady=policy, settings=settings)
     monkeypatch.setattr(section_module, "CELLS", 20)
     found = section.critical_set(run)

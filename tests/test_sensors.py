@@ -249,7 +249,7 @@ def late(small_runs, tmp_path_factory):
 @pytest.mark.slow
 def test_a_run_is_made_for_a_bound_that_covers_the_sensor(late, capsys):
     run, s = hyrl_mj.load_run(late.path), late.settings
-    assert (s.noise, s.sensor) == (0.15005, "uniform 0.05 + bias 0.05 + delay 1")
+    assert (s.eps, s.sensor) == (0.15005, "uniform 0.05 + bias 0.05 + delay 1")
     np.testing.assert_allclose(run.task.noisy, (0.05005 / 0.15005, 1))
     assert run.task.sensor_shares == (False, True)
     assert covers_sensor(run.task, 0.15005)
@@ -288,7 +288,7 @@ def test_a_robot_declares_its_sensors_once(tmp_path):
     )
     task = hyrl_mj.get_task(file)
     for options, noise in (({}, 0.07005), ({"eps": 0.1}, 0.1), ({"noise": "bias 0.04"}, 0.04)):
-        assert settings_of(task, RunOptions(**options)).noise == noise
+        assert settings_of(task, RunOptions(**options)).eps == noise
 
 
 @pytest.mark.parametrize(

@@ -69,7 +69,7 @@ def test_settings_are_changed_by_name(circle):
     [
         ("stage1.sample", 1, "Did you mean 'stage1.samples'"),
         ("stage1.samples", "many", "stage1: samples 'many' cannot be used"),
-        ("noise", 0.2, "give it with --eps"),
+        ("eps", 0.2, "give it with --eps"),
         ("stage1.algorithm", "sac", "give it with --algorithm"),
         ("stage1.options.nsteps", 3, "nsteps"),
     ],

@@ -48,10 +48,10 @@ def way_past(
     return turn, sense, local.observed(view, directions, lengths)
 
 
-def guard_of(task: FieldTask, noise: float) -> Guard:
+def guard_of(task: FieldTask, eps: float) -> Guard:
     """Returns what keeps a robot away from posts, and going; `noise` is the bound on its position [m]."""
     low, high = task.input_limits
-    return Guard(task.body, noise, float(low[0]), float(high[0]), float(high[1]))
+    return Guard(task.body, eps, float(low[0]), float(high[0]), float(high[1]))
 
 
 @dataclass(frozen=True)
@@ -62,13 +62,13 @@ class GuardedPolicy:
         task: with one post.
         policy: of the side.
         side: on which it passes the post.
-        noise: largest error of a measured coordinate [m] that the guard keeps away from posts for.
+        eps: largest error of a measured coordinate [m] that the guard keeps away from posts for.
     """
 
     task: Field
     policy: ObservationPolicy
     side: int
-    noise: float
+    eps: float
 
     def act(self, measured: np.ndarray) -> np.ndarray:
         """Returns inputs (n, m) for measurements (n, p).
@@ -80,7 +80,7 @@ class GuardedPolicy:
         side, sense = np.full(len(measured), self.side), np.zeros(len(measured))
         turn, sense, observed = way_past(self.task, measured[:, :-1], side, sense)
         u = self.policy.inputs(observed)
-        return guard_of(self.task, self.noise).inputs(Seen(measured), u, turn, sense)
+        return guard_of(self.task, self.eps).inputs(Seen(measured), u, turn, sense)
 
 
 @dataclass(frozen=True)
@@ -93,14 +93,14 @@ class FocusController:
     Attributes:
         task: the field.
         policies: the policy of each side, trained on `task.local`.
-        noise: largest error of a measured coordinate [m] that the guard keeps away from posts for.
+        eps: largest error of a measured coordinate [m] that the guard keeps away from posts for.
         first_side: the side on which the first post in focus is passed; None for the shorter way.
         settings: when the focus and its side change.
     """
 
     task: Driving
     policies: Mapping[int, ObservationPolicy]
-    noise: float
+    eps: float
     first_side: int | None = None
     settings: FocusSettings = FocusSettings()
 
@@ -113,12 +113,12 @@ class FocusController:
     def swing(self) -> float:
         """How far two measurements of the same place can be from each other [m], or a little more."""
         # Without noise, decisions must not follow rounding errors.
-        return max(2 * float(np.sqrt(2.0)) * self.noise, 0.1)
+        return max(2 * float(np.sqrt(2.0)) * self.eps, 0.1)
 
     @cached_property
     def guard(self) -> Guard:
         """What keeps the robot away from posts, and going."""
-        return guard_of(self.task, self.noise)
+        return guard_of(self.task, self.eps)
 
     def on_side(self, side: int) -> FocusController:
         """Returns this controller with the side on which it passes the first post in focus."""
@@ -192,14 +192,14 @@ class WithoutMemory:
 
 
 def for_posts(
-    local: Field, policies: Mapping[int, ObservationPolicy], noise: float, posts: int
+    local: Field, policies: Mapping[int, ObservationPolicy], eps: float, posts: int
 ) -> FocusController:
     """Returns a controller for any field of so many posts, from 1 to `MOST_POSTS`.
 
     Args:
         local: the task on which the policies were trained.
         policies: of each side.
-        noise: bound of the noise on the position [m].
+        eps: bound of the noise on the position [m].
         posts: number of posts.
 
     Raises:
@@ -211,14 +211,14 @@ def for_posts(
     number = np.arange(posts)
     places = np.stack([-2.0 - 2 * (number // 5), 2.0 * (number % 5) - 4], axis=1)
     layouts = Layouts(places[None, None], np.full((1, posts), 0.5), np.zeros((1, 2)))
-    return FocusController(Driving(local, layouts), policies, noise)
+    return FocusController(Driving(local, layouts), policies, eps)
 
 
 def controllers(
     task: Driving,
     policy: ObservationPolicy,
     policies: Mapping[int, ObservationPolicy],
-    noise: float,
+    eps: float,
 ) -> dict[str, Controller]:
     """Returns the controllers of a field by name: the stage-1 policy alone, HyRL, and HyRL without learning.
 
@@ -228,6 +228,6 @@ def controllers(
     laws = {side: TangentLaw(task.local, side) for side in (LEFT, RIGHT)}
     return {
         "policy": PolicyController(WithoutMemory(task, policy)),
-        "hyrl": FocusController(task, policies, noise),
-        "law": FocusController(task, laws, noise),
+        "hyrl": FocusController(task, policies, eps),
+        "law": FocusController(task, laws, eps),
     }

@@ -44,10 +44,10 @@ class DriveOptions:
     attack: bool = False
 
 
-def bounds_made_for(local: Field, noise: float) -> Bounds:
+def bounds_made_for(local: Field, eps: float) -> Bounds:
     """Returns the bounds that policies were made for, on a task with a bound of the noise [m]."""
     # Position and heading of the robot, position and velocity of the post.
-    return Bounds(*(noise * float(local.noisy[column]) for column in (0, 2, POSE, POSE + 2)))
+    return Bounds(*(eps * float(local.noisy[column]) for column in (0, 2, POSE, POSE + 2)))
 
 
 def bounds_asked_for(options: DriveOptions, made_for: Bounds) -> Bounds:

@@ -17,7 +17,7 @@ def is_local(task: Task) -> TypeGuard[Field]:
     return isinstance(task, Field)
 
 
-def acting_policy(task: Task, policy: Policy, mode: int, noise: float) -> Policy:
+def acting_policy(task: Task, policy: Policy, mode: int, eps: float) -> Policy:
     """Returns what acts in a mode under noise of a bound, from the policy that was trained for the mode.
 
     On the task of fields this is the policy with a guard, on others the policy itself.
@@ -32,7 +32,7 @@ def acting_policy(task: Task, policy: Policy, mode: int, noise: float) -> Policy
             f"the policy of mode {mode} is a {type(policy).__name__}, and {task.name} takes networks: train "
             f"them with hyrl-mj run {task.name}"
         )
-    return GuardedPolicy(task, policy, mode, noise)
+    return GuardedPolicy(task, policy, mode, eps)
 
 
 def exported_controller(
@@ -50,9 +50,9 @@ def exported_controller(
     task = controller.task
     if is_local(task):
         sides: dict[int, Any] = {**controller.policies}  # with guards
-        noise = next(iter(sides.values())).noise
+        eps = next(iter(sides.values())).eps
         posts = 1 if field is None else read_field(field).layouts.posts
-        return for_posts(task, {q: side.policy for q, side in sides.items()}, noise, posts)
+        return for_posts(task, {q: side.policy for q, side in sides.items()}, eps, posts)
     if field is not None:
         raise BadInput(f"{task.name} has no field of posts: leave --field out")
     return controller

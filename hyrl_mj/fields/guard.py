@@ -18,7 +18,7 @@ class Guard:
 
     Attributes:
         body: radius of the robot [m].
-        noise: largest error of a measured coordinate [m]; the heading's is half as much [rad].
+        eps: largest error of a measured coordinate [m]; the heading's is half as much [rad].
         low, high: limits of the forward speed [m/s].
         rate: greatest rate of turn [rad/s].
         decay: the clearance beyond the margin may shrink by this share of itself in a second [1/s].
@@ -29,7 +29,7 @@ class Guard:
     """
 
     body: float
-    noise: float
+    eps: float
     low: float
     high: float
     rate: float
@@ -40,7 +40,7 @@ class Guard:
     @property
     def margin(self) -> float:
         """Distance of the measured position from a post's surface that tells of no crash [m]."""
-        return self.body + float(np.sqrt(2.0)) * self.noise
+        return self.body + float(np.sqrt(2.0)) * self.eps
 
     def inputs(self, seen: Seen, u: np.ndarray, turn: np.ndarray, sense: np.ndarray) -> np.ndarray:
         """Returns inputs (n, 2) [m/s], [rad/s] instead of those of a policy.
@@ -103,7 +103,7 @@ class Guard:
         towards = seen.towards
         allowed = self.decay * np.maximum(seen.room - self.margin, 0.0) - seen.coming
         # The direction of the post is not known better than this [rad].
-        astray = np.sqrt(2.0) * self.noise / seen.far + self.noise / 2
+        astray = np.sqrt(2.0) * self.eps / seen.far + self.eps / 2
         across = np.sqrt(np.maximum(1 - towards * towards, 0.0)) * astray
         ahead, behind, close = towards + across, across - towards, allowed < 0
         most = np.where(ahead > 0, allowed / np.maximum(ahead, 1e-3), np.inf)

@@ -17,14 +17,14 @@ OPTIONS = {
     "task": "TASK",
     "preset": "--preset",
     "seed": "--seed, in a sweep --seeds",
-    "noise": "--eps",
+    "eps": "--eps",
     "sensor": "--noise",
     "horizon": "--horizon",
     "everywhere": "--all-coordinates",
     "stage1.algorithm": "--algorithm",
 }
 # Names of options that differ from those of their settings.
-NAMES = {"noise": "eps", "sensor": "noise", "stage1": "policy", "everywhere": "all_coordinates"}
+NAMES = {"sensor": "noise", "stage1": "policy", "everywhere": "all_coordinates"}
 
 
 def changed(settings: Settings, changes: Mapping[str, object]) -> Settings:

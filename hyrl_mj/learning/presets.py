@@ -154,7 +154,7 @@ def preset(
     task: Task,
     name: str = "fast",
     *,
-    noise: float = 0.1,
+    eps: float = 0.1,
     seed: int = 0,
     horizon: float | None = None,
     agent: Agent | None = None,
@@ -165,7 +165,7 @@ def preset(
     Args:
         task: the robot and its problem.
         name: "fast", "paper" (the paper's training), or "smoke" (seconds, to check that all stages run).
-        noise: bound eps of the measurement noise that the controller has to survive.
+        eps: bound of the measurement noise that the controller has to survive.
         seed: seed of all random numbers.
         horizon: time T of the backward propagation [s]; by default the sets are sized to the noise, and
             preset "paper" takes the paper's T.
@@ -185,7 +185,7 @@ def preset(
     if task.kinematic and dimension == 2:
         cells = aligned_cells(task, cells)
     if not task.kinematic and dimension == 3 and name != "smoke":
-        cells = enough_cells(task.chart, task.noise_in_chart(noise), cells, _MOST_CELLS)
+        cells = enough_cells(task.chart, task.noise_in_chart(eps), cells, _MOST_CELLS)
     if (most := task.learning.cells) is not None:
         rods, cells = min(rods, most), min(cells, most)
         resolution = _RESOLUTION_COARSE
@@ -193,7 +193,7 @@ def preset(
         task=reference(task),
         preset=name,
         seed=seed,
-        noise=noise,
+        eps=eps,
         horizon=task.learning.horizon if horizon is None and name == "paper" else horizon,
         stage1=stage1,
         stage6=replace(stage6, warm_start=True) if agent else stage6,

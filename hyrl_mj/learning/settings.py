@@ -121,7 +121,7 @@ class Settings:
         task: name of the task, or the file that defines it.
         preset: name of the preset of the other settings.
         seed: seed of all random numbers.
-        noise: bound eps of the measurement noise that the controller has to survive.
+        eps: bound of the measurement noise that the controller has to survive.
         horizon: time T of the backward propagation [s]; None to size the sets to the noise.
         stage1: training of the first policy (stage 1), or the agent in its place.
         stage6: training of each mode's policy (stage 6).
@@ -146,7 +146,7 @@ class Settings:
     task: Annotated[str, Text()]
     preset: Annotated[str, OneOf(PRESETS)]
     seed: Annotated[int, By(check_seed)]
-    noise: Annotated[float, By(check_bound)]
+    eps: Annotated[float, By(check_bound)]
     horizon: Annotated[float | None, Optional(Number(0, 3_600, above=True))]
     stage1: Annotated[Training | Agent, Instance((Training, Agent))]
     stage6: Annotated[Training, Instance((Training,))]
@@ -182,17 +182,17 @@ class Settings:
         """
         if self.sensor is not None:
             bound, shares = Sensor.parse(self.sensor).on(task)
-            if bound != self.noise:
+            if bound != self.eps:
                 raise BadInput(
                     f"the sensor {self.sensor} needs a noise bound of {bound:g} on {task.name}, and not "
-                    f"{self.noise:g}: start a new run"
+                    f"{self.eps:g}: start a new run"
                 )
             return task.with_sensor(self.sensor, shares)
         return task.noisy_everywhere() if self.everywhere else task
 
     def check(self, task: Task) -> None:
         """Raises `BadInput` if a value does not fit the task: its chart, its episodes, or its inputs."""
-        task.check_noise(self.noise, self.everywhere)
+        task.check_noise(self.eps, self.everywhere)
         longest = task.max_steps * task.dt
         if self.horizon is not None and self.horizon > longest:
             raise BadInput(

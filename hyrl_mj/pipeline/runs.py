@@ -215,7 +215,7 @@ def _run_all(run: Run, say: Say, stages: Collection[str] = STAGES) -> Run:
         say(f"the run will be examined {examination_plan(run)}")
     s = run.settings
     if "partition" in stages and not run.manifest.is_done("partition"):
-        bounds = run.task.noise_in_chart(s.noise, s.everywhere)
+        bounds = run.task.noise_in_chart(s.eps, s.everywhere)
         if sentence := coarseness(run.task.chart, s.cells, bounds):
             say(sentence)
     for stage in stages:
@@ -261,7 +261,7 @@ def _settings(task: Task, options: RunOptions | AgentOptions, **changes: Any) ->
         eps, shares = (parsed := Sensor.parse(sensor)).on(task)
         sensor, task = str(parsed), task.with_sensor(str(parsed), shares)
     eps = BOUND if eps is None else eps
-    settings = preset(task, options.preset, noise=eps, seed=seed, horizon=horizon, **changes)
+    settings = preset(task, options.preset, eps=eps, seed=seed, horizon=horizon, **changes)
     settings = replace(settings, everywhere=options.all_coordinates, sensor=sensor)
     if options.set:
         settings = changed(settings, options.set)

@@ -78,7 +78,7 @@ def critical_set_stage(run: Run, say: Say) -> None:
     """Stage 2: finds the critical set."""
     s = run.settings
     critical = find_critical_set(
-        run.task, run.steady, s.rods, s.resolution, s.search, s.noise, s.ways
+        run.task, run.steady, s.rods, s.resolution, s.search, s.eps, s.ways
     )
     critical.save(run.path / "critical_set.npz")
     say(critical.sentence(run.task))
@@ -88,7 +88,7 @@ def partition_stage(run: Run, say: Say) -> None:
     """Stage 3: partitions the chart."""
     s = run.settings
     points = run.critical_set.points
-    partition = make_partition(run.task, run.steady, points, s.cells, s.noise, s.ways)
+    partition = make_partition(run.task, run.steady, points, s.cells, s.eps, s.ways)
     partition.save(run.path / "partition.npz")
     say(partition.sentence(run.task, s.ways))
 
@@ -101,11 +101,11 @@ def extended_sets_stage(run: Run, say: Say) -> None:
         if Lattice.possible(task) and Lattice.decides(task, run.lattice_grid):
             lattice = Lattice.tabulate(task, run.lattice_grid)
             ways = Limit.solve(lattice, split)
-            split = with_room(task, run.steady, split, ways, s.noise)
+            split = with_room(task, run.steady, split, ways, s.eps)
             ways = Limit.solve(lattice, split)
             points = boundary(split)
         split.save(run.path / "split.npz")
-    sets = extend(task, run.steady, points, split, s.noise, s.horizon, ways, s.overlap)
+    sets = extend(task, run.steady, points, split, s.eps, s.horizon, ways, s.overlap)
     sets.save(run.path / "extended_sets.npz")
     say(sets.sentence(task))
 
@@ -118,7 +118,7 @@ def retrain_stage(run: Run, say: Say) -> None:
     s, sets = run.settings, run.extended_sets
     algorithms.check_named(s.stage6.algorithm)
     warm_start = partial(start_policy, run.steady, run.partition)
-    part_of = partial(part_policy, run.task, run.steady, run.partition, noise=sets.noise)
+    part_of = partial(part_policy, run.task, run.steady, run.partition, eps=sets.eps)
     parts, table_of = None, None
     if run.task.effort.attacked:
         parts, held = part_of, HeldInputs.from_sets(run.task, sets, s.table)
@@ -196,7 +196,7 @@ def subject_of(run: Run, controllers: dict[str, Controller], partition: Partitio
         controllers,
         run.critical_set.points,
         partition.parts,
-        s.noise,
+        s.eps,
         s.everywhere,
         s.lattice,
         playable=run.why_no_game is None,

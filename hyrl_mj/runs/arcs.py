@@ -79,7 +79,7 @@ def noisy_arcs(
         )
     if sensor is not None and eps is not None:
         raise BadInput(f"the noise {noise!r} tells its own bounds: leave eps out")
-    bound = task.check_noise(run.settings.noise if eps is None else eps)
+    bound = task.check_noise(run.settings.eps if eps is None else eps)
     steps = None if horizon is None else samples(task, horizon)
     game = None
     if noise == "worst":

@@ -30,8 +30,8 @@ def losses_of(run: Run) -> Losses | None:
     if not run.exact:
         return None
     task, policy, parts, s = run.task, run.steady, run.partition, run.settings
-    pis = all_part_policies(task, policy, parts, s.noise)
-    return sort_losses(task, policy, parts.parts, pis, s.noise, s.lattice)
+    pis = all_part_policies(task, policy, parts, s.eps)
+    return sort_losses(task, policy, parts.parts, pis, s.eps, s.lattice)
 
 
 def worst_arc(run: Run, losses: Losses | None) -> HybridArc | None:
@@ -42,7 +42,7 @@ def worst_arc(run: Run, losses: Losses | None) -> HybridArc | None:
     attack searches for noise, from starts half of which are near M*. If it finds none, attacks from a third
     of these starts search for noise of 2, 4 and 8 times the bound.
     """
-    task, eps, loop = run.task, run.settings.noise, PolicyController(run.policy)
+    task, eps, loop = run.task, run.settings.eps, PolicyController(run.policy)
     if losses is not None:
         parts = losses.grazing, losses.undecided, losses.unaided
         kinds = sorted(parts, key=len, reverse=True)
@@ -77,7 +77,7 @@ def _first_lost(arcs: Iterable[HybridArc]) -> HybridArc | None:
 def usual_arc(run: Run) -> HybridArc:
     """Returns a run of the policy under the paper's noise, from M* if there is one."""
     start, scene, s = critical_start(run), run.task.scene, run.settings
-    z0, noise = scene.starts[0] if start is None else start, Noise("alternating", s.noise)
+    z0, noise = scene.starts[0] if start is None else start, Noise("alternating", s.eps)
     (arc,) = simulate_batch(run.task, run.policy, z0, noise, horizon=scene.time, seed=s.seed)
     return arc
 

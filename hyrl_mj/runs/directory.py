@@ -64,7 +64,7 @@ class Run:
 
     def __repr__(self) -> str:
         s, path = self.settings, str(self.path)
-        return f"Run({path!r}: {s.task}, eps {s.noise:g}, seed {s.seed}, preset {s.preset})"
+        return f"Run({path!r}: {s.task}, eps {s.eps:g}, seed {s.seed}, preset {s.preset})"
 
     @cached_property
     def task(self) -> Task:
@@ -217,7 +217,7 @@ class Run:
         """The hybrid controller, from stage 7."""
         extended, starts = self.extended_sets, None
         mode_policies = {
-            q: acting_policy(self.task, policy, q, self.settings.noise)
+            q: acting_policy(self.task, policy, q, self.settings.eps)
             for q, policy in self.mode_policies.items()
         }
         flow_sets = dict(zip(extended.modes, extended.sets, strict=True))
@@ -250,13 +250,13 @@ class Run:
     def verdict(self) -> Verdict:
         """What the run is worth, in one word with its reasons."""
         facts = self.robustness, self.retraining, self.arrivals, self.settings.verdict
-        return Verdict.judge(self.task, self.settings.noise, *facts)
+        return Verdict.judge(self.task, self.settings.eps, *facts)
 
     @property
     def is_examined_as_usual(self) -> bool:
         """Whether the examination on disk is under the run's own noise, and not under another one."""
         found, own = self.robustness, self.settings
-        return (found.eps, found.everywhere) == (own.noise, own.everywhere)
+        return (found.eps, found.everywhere) == (own.eps, own.everywhere)
 
     @cached_property
     def versions(self) -> dict[str, str]:

@@ -74,7 +74,7 @@ def find_critical_set(
     cells: int,
     resolution: float,
     method: str = "rods",
-    noise: float = 0.0,
+    eps: float = 0.0,
     settings: WaySettings = WaySettings(),
 ) -> CriticalSet:
     """Searches for the critical set M*: property (*) and equation (8) of the paper.
@@ -93,7 +93,7 @@ def find_critical_set(
         cells: grid points along the longest side of the chart from which the search starts.
         resolution: length of the shortest rods, as a share of the first.
         method: "rods" or "outcome".
-        noise: bound eps of the measurement noise; "outcome" finds M* across failures that are a few times
+        eps: bound of the measurement noise; "outcome" finds M* across failures that are a few times
             as wide.
         settings: when runs part, and what is one piece of M*.
 
@@ -111,7 +111,7 @@ def find_critical_set(
     else:
         pairs = grid.neighbours()
         centres = critical_points(
-            task, policy, grid.nodes, pairs, grid.cell, resolution, noise, settings
+            task, policy, grid.nodes, pairs, grid.cell, resolution, eps, settings
         )
     points = np.unique(task.chart.wrap(centres), axis=0)
     component = _pieces(task, points, settings.link * grid.cell)

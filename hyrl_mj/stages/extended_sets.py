@@ -39,7 +39,7 @@ class ExtendedSets(Saved):
         winning: W_i, the winning region of each mode, as (N,) bool over the grid's nodes: from there pi_i
             reaches the set-point.
         horizon: time T of the backward propagation [s]; 0 without propagation.
-        noise: bound eps of the measurement noise that the sets are made for.
+        eps: bound of the measurement noise that the sets are made for.
         points: (K, d) points of M* where modes meet, and the way of one of them is open.
         room: (K,) how far across M* two modes that meet there both win, in the unit of the noise; 2 eps are
             needed.
@@ -52,7 +52,7 @@ class ExtendedSets(Saved):
     sets: tuple[GridSet, ...]
     winning: tuple[np.ndarray, ...]
     horizon: float
-    noise: float
+    eps: float
     points: np.ndarray
     room: np.ndarray
     between: np.ndarray = field(default_factory=lambda: np.empty((0, 2), dtype=int))
@@ -68,7 +68,7 @@ class ExtendedSets(Saved):
 
     def __repr__(self) -> str:
         shares = [f"{q}: {m.share:.1%}" for q, m in zip(self.modes, self.sets, strict=True)]
-        return f"ExtendedSets({', '.join(shares)} of the chart, eps {self.noise:g})"
+        return f"ExtendedSets({', '.join(shares)} of the chart, eps {self.eps:g})"
 
     def sentence(self, task: Task) -> str:
         """Returns a one-line description."""
@@ -76,15 +76,13 @@ class ExtendedSets(Saved):
             return "one mode, whose set is the whole chart"
         reach = f"T = {self.horizon:.2g} s" if self.horizon else "as far as the ways are open"
         text = f"{len(self.sets)} extended sets, {reach}{self._shared()}"
-        narrow = narrow_sentence(
-            task, self.points, self.between, self.room, self.narrow, self.noise
-        )
+        narrow = narrow_sentence(task, self.points, self.between, self.room, self.narrow, self.eps)
         return f"{text}; {narrow}" if narrow else text
 
     @property
     def narrow(self) -> np.ndarray:
         """Whether the noise needs more room than two modes have at each of the points: (K,) bool."""
-        return np.asarray(self.room < 2 * self.noise - self.sets[0].grid.cell)
+        return np.asarray(self.room < 2 * self.eps - self.sets[0].grid.cell)
 
     def _shared(self) -> str:
         """Returns how much of the chart the sets of modes that meet share."""
@@ -105,7 +103,7 @@ def extend(
     policy: Policy,
     points: np.ndarray,
     partition: Partition,
-    noise: float,
+    eps: float,
     horizon: float | None = None,
     ways: Limit | None = None,
     settings: OverlapSettings = OverlapSettings(),
@@ -128,7 +126,7 @@ def extend(
         policy: the stage-1 policy.
         points: (N, d) of M*, from stage 2.
         partition: M_i, from stage 3.
-        noise: bound eps of the measurement noise.
+        eps: bound of the measurement noise.
         horizon: time T of the backward propagation [s]. By default, the shortest with which every set
             reaches 2 eps and one sample over M* wherever its mode succeeds; the sets end there.
         ways: from where each way is open, for an agent. Beyond its decision an agent may be unable to go
@@ -137,7 +135,7 @@ def extend(
         settings: when a horizon is long enough, and what is a gap.
     """
     points = check_points(task.chart, points, task.name)
-    case = _Case(task, policy, points, partition, noise, horizon, settings)
+    case = _Case(task, policy, points, partition, eps, horizon, settings)
     winning = case.winning() if ways is None else open_ways(ways, partition.grid)
     roomy = case.trim(winning)
     if ways is None or horizon is not None:
@@ -150,9 +148,9 @@ def extend(
         case.widen(reached, roomy),
         winning,
         propagated,
-        noise,
+        eps,
         case.points[rows],
-        2 * noise * room,
+        2 * eps * room,
         np.array(partition.modes)[pair],
     )
 
@@ -174,20 +172,20 @@ class _Case:
         policy: Policy,
         points: np.ndarray,
         partition: Partition,
-        noise: float,
+        eps: float,
         horizon: float | None,
         settings: OverlapSettings,
     ):
         self.task, self.points, self.partition = task, points, partition
         self.horizon, self.settings = horizon, settings
         self.grid, self.parts = partition.grid, partition.parts
-        self.eps, self.hop = task.noise_in_chart(noise), longest_hop(task, policy, self.grid)
-        near = neighbourhood(partition, noise, self.hop)
+        self.eps, self.hop = task.noise_in_chart(eps), longest_hop(task, policy, self.grid)
+        near = neighbourhood(partition, eps, self.hop)
         self._pis = part_policies(task, policy, partition, near)
         by = 2 * self.eps + self.hop * (task.noise_in_chart(1.0) > 0)
         self.wanted = [part.dilated_by_box(by) for part in self.parts]
         # The extended sets lie among these candidates.
-        radius = 3 * noise + near + (0.0 if horizon is None else horizon / task.dt * near)
+        radius = 3 * eps + near + (0.0 if horizon is None else horizon / task.dt * near)
         self._candidates = [part.dilated(radius).mask for part in self.parts]
         off = distance_to(task.chart, points, self.grid.nodes)
         self.around = off <= float(np.linalg.norm((2 * self.eps + self.hop) / task.chart.scale))

@@ -118,7 +118,7 @@ class ModeGround:
         A mode with a reward of its own is trained from all starts of its task.
         """
         states, task = self.states, self.task
-        caution = self.judge.margin * states.extended.noise * np.array(states.shares)
+        caution = self.judge.margin * states.extended.eps * np.array(states.shares)
         if states.rewarded:
             return Domain(task.starts, caution=caution)
         exit_reward = task.worst_reward / (1 - gamma)

@@ -156,7 +156,7 @@ class Episodes:
         with np.errstate(divide="ignore"):
             most = (task.chart.sides / (2 * states.bound)).min()
         self.margin = min(settings.margin, (1 + most) / 2)  # noise must not hide the whole chart
-        self.noise = Noise("uniform", self.margin * states.extended.noise)
+        self.noise = Noise("uniform", self.margin * states.extended.eps)
         picked = states.early[states.selected[states.early]]
         rng, episodes = np.random.default_rng(0), sum(sizes)
         # More than are needed: those too close to where the mode cannot succeed are left out.

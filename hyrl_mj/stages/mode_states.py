@@ -35,7 +35,7 @@ class ModeStates:
         self.task, self.extended, self.mode = task.for_mode(mode), extended, mode
         self.rewarded = self.task is not task
         self.shares = tuple(float(share) for share in self.task.noisy)
-        self.bound = task.noise_in_chart(extended.noise)
+        self.bound = task.noise_in_chart(extended.eps)
         index = extended.modes.index(mode)
         self.within = extended.sets[index].dilated_by_box(self.bound)
         self.grid = self.within.grid

@@ -123,7 +123,7 @@ def make_partition(
     policy: Policy,
     points: np.ndarray,
     cells: int,
-    noise: float = 0.0,
+    eps: float = 0.0,
     settings: WaySettings = WaySettings(),
 ) -> Partition:
     """Splits the nodes of a grid by the way that the closed loop goes from each (paper, Step 3).
@@ -136,22 +136,22 @@ def make_partition(
         policy: the stage-1 policy.
         points: (N, d) of M*, from stage 2.
         cells: cells of the grid along the longest side of the chart, if they were square.
-        noise: bound eps of the measurement noise; in charts of three and more dimensions the nodes lie close
+        eps: bound of the measurement noise; in charts of three and more dimensions the nodes lie close
             enough to tell states apart that it does, as far as `cells` allows.
         settings: which ways are modes.
     """
     points = check_points(task.chart, points, task.name)
-    grid = resolving(task.chart, cells, points, task.noise_in_chart(max(noise, 1e-6)))
+    grid = resolving(task.chart, cells, points, task.noise_in_chart(max(eps, 1e-6)))
     simulated, neighbours = thinned(task, grid)
     first = WayRuns.from_rollout(
         task, way_runs(task, policy, grid.nodes[simulated], label="partition")
     )
     nodes, near = grid.nodes[simulated], None
-    if first.passing is not None and noise and len(points):
-        width = strips.width(task, noise, longest_hop(task, policy, grid))
-        eps = float((task.noise_in_chart(noise) / task.chart.scale).max())
+    if first.passing is not None and eps and len(points):
+        width = strips.width(task, eps, longest_hop(task, policy, grid))
+        hidden = float((task.noise_in_chart(eps) / task.chart.scale).max())
         a, b = neighbours
-        across = strips.across(task, nodes, points, 2 * max(eps, grid.cell))
+        across = strips.across(task, nodes, points, 2 * max(hidden, grid.cell))
         neighbours = np.append(a, across[0]), np.append(b, across[1])
 
         def near(rows: np.ndarray) -> np.ndarray:
@@ -170,7 +170,7 @@ def make_partition(
         return np.column_stack([ways.members(runs), ways.works(runs), runs.arrived])
 
     everywhere, columns = np.ones(grid.size, dtype=bool), len(ways.modes) + 2
-    wedge = settings.wedge * noise
+    wedge = settings.wedge * eps
     known = refined(task, grid, everywhere, points, wedge, tell, columns).astype(bool)
     members, succeeds = known[:, :-2], known[:, -1]
     works, failed = np.flatnonzero(known[:, -2]), np.flatnonzero(~known[:, -2])
@@ -185,7 +185,7 @@ def make_partition(
 
 
 def with_room(
-    task: Task, policy: Policy, partition: Partition, limit: Limit, noise: float
+    task: Task, policy: Policy, partition: Partition, limit: Limit, eps: float
 ) -> Partition:
     """Returns the parts, changed where the policy goes a way that is about to close while another is not.
 
@@ -199,13 +199,13 @@ def with_room(
         policy: the agent.
         partition: M_i, by the way that the policy goes.
         limit: from where each way is open.
-        noise: bound eps of the measurement noise.
+        eps: bound of the measurement noise.
     """
     grid = partition.grid
     if len(partition.parts) < 2:
         return partition
     hop = longest_hop(task, policy, grid) * (task.noise_in_chart(1.0) > 0)
-    wanted = float((2 * task.noise_in_chart(noise) + hop).max())
+    wanted = float((2 * task.noise_in_chart(eps) + hop).max())
     room = -np.stack([GridSet.from_mask(grid, open_).values for open_ in open_ways(limit, grid)])
     masks = np.stack([part.mask for part in partition.parts])
     own = np.where(masks, room, -np.inf).max(axis=0)
@@ -292,25 +292,25 @@ def part_policies(
 
 
 def part_policy(
-    task: Task, policy: Policy, partition: Partition, mode: int, noise: float
+    task: Task, policy: Policy, partition: Partition, mode: int, eps: float
 ) -> PartPolicy:
     """Returns pi_i of a mode, with as wide a neighbourhood of M* as the noise and the steps need."""
-    return all_part_policies(task, policy, partition, noise)[partition.modes.index(mode)]
+    return all_part_policies(task, policy, partition, eps)[partition.modes.index(mode)]
 
 
 def all_part_policies(
-    task: Task, policy: Policy, partition: Partition, noise: float
+    task: Task, policy: Policy, partition: Partition, eps: float
 ) -> tuple[PartPolicy, ...]:
     """Returns pi_i of each mode, with as wide a neighbourhood of M* as `part_policy` takes."""
-    near = neighbourhood(partition, noise, longest_hop(task, policy, partition.grid))
+    near = neighbourhood(partition, eps, longest_hop(task, policy, partition.grid))
     return part_policies(task, policy, partition, near)
 
 
-def neighbourhood(partition: Partition, noise: float, hop: np.ndarray) -> float:
+def neighbourhood(partition: Partition, eps: float, hop: np.ndarray) -> float:
     """Returns the width of the neighbourhood of M*: the noise, some cells, or one sample's hop (d,)."""
     grid = partition.grid
     cells = NEIGHBOURHOOD_CELLS if len(partition.parts) <= 2 else CELLS_OF_WEDGES
-    return max(noise, cells * grid.cell, float(np.linalg.norm(hop / grid.chart.scale)))
+    return max(eps, cells * grid.cell, float(np.linalg.norm(hop / grid.chart.scale)))
 
 
 def longest_hop(task: Task, policy: Policy, grid: Nodes) -> np.ndarray:

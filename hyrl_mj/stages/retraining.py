@@ -40,7 +40,7 @@ def start_policy(
     task = ground.task
     if not ALGORITHMS[settings.algorithm].is_actor_critic:
         return policy if isinstance(policy, MlpPolicy) and fits(task, settings, policy) else None
-    pi = part_policy(task, policy, partition, ground.mode, ground.states.extended.noise)
+    pi = part_policy(task, policy, partition, ground.mode, ground.states.extended.eps)
     return distil(task, pi, ground.starts, settings, seed)
 
 

@@ -20,7 +20,7 @@ def critical_points(
     neighbours: tuple[np.ndarray, np.ndarray],
     cell: float,
     resolution: float,
-    noise: float = 0.0,
+    eps: float = 0.0,
     settings: WaySettings = WaySettings(),
 ) -> np.ndarray:
     """Searches by outcome: returns middles (N, d) between close starts whose runs go different ways.
@@ -29,7 +29,7 @@ def critical_points(
     as a policy with inertia may crash in between, the middle of these is critical.
 
     Args:
-        task, policy, resolution, noise, settings: as in `find_critical_set`.
+        task, policy, resolution, eps, settings: as in `find_critical_set`.
         nodes: (n, d) starts.
         neighbours: (k,), (k,) indices of starts that lie next to each other.
         cell: the usual distance between two neighbours, in scaled units.
@@ -40,7 +40,7 @@ def critical_points(
     works = ways.works(runs)
     if not works.any():
         return np.empty((0, task.chart.dimension))
-    bound = (task.noise_in_chart(noise) / task.chart.scale).max()
+    bound = (task.noise_in_chart(eps) / task.chart.scale).max()
     wedge = max(settings.wedge * bound, resolution * cell)
     longest = np.linalg.norm(_gap(task, nodes, *neighbours) / task.chart.scale, axis=1).max()
     first, second = _across(task, nodes, neighbours, works, runs.alive)

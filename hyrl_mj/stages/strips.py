@@ -12,7 +12,7 @@ import numpy as np
 from hyrl_mj.tasks import Task
 
 
-def width(task: Task, noise: float, hop: np.ndarray) -> float:
+def width(task: Task, eps: float, hop: np.ndarray) -> float:
     """Returns the width that a strip needs, in scaled units.
 
     The set of the other mode reaches 2 eps and a hop over M*, and eps and a hop over the other edge of the
@@ -21,11 +21,11 @@ def width(task: Task, noise: float, hop: np.ndarray) -> float:
 
     Args:
         task: gives the noisy coordinates.
-        noise: bound eps of the measurement noise.
+        eps: bound of the measurement noise.
         hop: (d,) longest hop in one sample.
     """
-    eps = task.noise_in_chart(noise)
-    return float(np.linalg.norm((5 * eps + 3 * hop) * (eps > 0) / task.chart.scale))
+    bounds = task.noise_in_chart(eps)
+    return float(np.linalg.norm((5 * bounds + 3 * hop) * (bounds > 0) / task.chart.scale))
 
 
 def across(task: Task, nodes: np.ndarray, points: np.ndarray, reach: float) -> np.ndarray:

@@ -133,7 +133,7 @@ class HeldInputs:
             axes = [np.linspace(a, b, VALUES[m]) for a, b in zip(*task.input_limits, strict=True)]
             inputs = np.array(list(product(*axes)))
         rows = np.flatnonzero(task.goes_on(grid.nodes))
-        bound = task.noise_in_chart(extended.noise)
+        bound = task.noise_in_chart(extended.eps)
         scaled = float((bound / task.chart.scale).max())
         away = max(settings.cells * grid.cell, settings.bounds * scaled)
         samples = _samples(task, grid.nodes[rows], inputs, away, settings.longest)
@@ -173,7 +173,7 @@ class HeldInputs:
     @cached_property
     def bound(self) -> np.ndarray:
         """(d,) largest error of a measured chart point, along each coordinate."""
-        return self.task.noise_in_chart(self.extended.noise)
+        return self.task.noise_in_chart(self.extended.eps)
 
     def own(self, mode: int) -> np.ndarray:
         """Returns whether the rows are in the set of a mode: (k,) bool."""

@@ -28,14 +28,14 @@ def beginning(run: Run, out: Path | None = None) -> str:
     if agent and not agent.source:
         rest = "" if s.horizon is None else f", horizon={s.horizon}"
         rest += ", all_coordinates=True" if s.everywhere else ""
-        noise = f"eps={s.noise}" if s.sensor is None else f"noise={s.sensor!r}"
+        noise = f"eps={s.eps}" if s.sensor is None else f"noise={s.sensor!r}"
         rest += "" if out is None else f", out={str(out)!r}"
         return (
             f"hyrl_mj.robustify({s.task!r}, policy, {noise}, seed={s.seed}, "
             f"preset={s.preset!r}{rest})"
         )
     words = ["hyrl-mj", *(["robustify", s.task, *agent.options] if agent else ["run", s.task])]
-    words += ["--eps", f"{s.noise}"] if s.sensor is None else ["--noise", s.sensor]
+    words += ["--eps", f"{s.eps}"] if s.sensor is None else ["--noise", s.sensor]
     words += ["--seed", f"{s.seed}", "--preset", s.preset]
     if not agent and s.stage1.algorithm != run.task.learning.algorithm:
         words += ["--algorithm", s.stage1.algorithm]
@@ -88,7 +88,7 @@ def _again(run: Run) -> Settings:
     s = run.settings
     algorithm = None if run.agent or not _is_known(run) else s.stage1.algorithm
     again = preset(
-        run.task, s.preset, noise=s.noise, seed=s.seed, horizon=s.horizon,
+        run.task, s.preset, eps=s.eps, seed=s.seed, horizon=s.horizon,
         agent=run.agent, algorithm=algorithm,
     )  # fmt: skip
     return replace(again, everywhere=s.everywhere, sensor=s.sensor)

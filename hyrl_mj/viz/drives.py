@@ -130,7 +130,7 @@ def drive_run(
     if out is not None:
         check_replay(local, out, how)
         _check_shown(shown, len(field.starts))
-    made_for = run.settings.noise
+    made_for = run.settings.eps
     for caution in (*cautions(field, local.body), *noise_cautions(local, made_for, options)):
         logging.getLogger("hyrl_mj").warning("warning: %s", printable(caution))
     drives = drive(local, policy, policies, made_for, field, options, run.settings.attack)

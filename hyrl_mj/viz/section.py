@@ -141,14 +141,14 @@ def critical_sets(run: Run, cuts: Sequence[Section]) -> list[CriticalSet]:
     """Returns M* of a run in sections of one chart, searched for by outcome in all of them at once."""
     if not (cuts[0].cut and len(run.critical_set.points)):
         return [run.critical_set] * len(cuts)
-    resolution, noise = run.settings.resolution, run.settings.noise
+    resolution, eps = run.settings.resolution, run.settings.eps
     grid = Grid.with_cells(cuts[0].chart, max(run.settings.rods, CELLS))
     nodes = np.vstack([cut.lift(grid.nodes) for cut in cuts])
     firsts = len(grid.nodes) * np.arange(len(cuts))[:, None]
     first, second = ((firsts + ends).ravel() for ends in grid.neighbours())
     rods, ways = (first, second), run.settings.ways
     points = critical_points(
-        cuts[0].task, run.steady, nodes, rods, grid.cell, resolution, noise, ways
+        cuts[0].task, run.steady, nodes, rods, grid.cell, resolution, eps, ways
     )
     found = []
     for cut in cuts:

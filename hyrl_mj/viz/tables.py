@@ -72,7 +72,7 @@ def replay_table(run: Run, arcs: Arcs) -> Table:
         endings = [_ending(task, arcs[start, who]) for who in columns]
         rows.append([f"{point} on M*" if start == "critical" else point, *endings])
     headings = [f"start ({', '.join(task.chart.names)}) in {units}", *columns.values()]
-    noise = f"alternating noise {s.noise:g}{', on M* the strongest known' if run.exact else ''}"
+    noise = f"alternating noise {s.eps:g}{', on M* the strongest known' if run.exact else ''}"
     return Table(f"{task.name}: {noise}, seed {s.seed}", headings, rows)
 
 

@@ -43,7 +43,7 @@ def figures(runs: Runs) -> Iterator[Figure]:
 
 def _extension(run: Run) -> Figure:
     task, settings = run.task, run.settings
-    args = (task, run.policy, run.critical_set.points, run.partition, settings.noise)
+    args = (task, run.policy, run.critical_set.points, run.partition, settings.eps)
     calls: list[tuple[Any, np.ndarray, LoopSettings]] = []
     runs_of_ways = import_module(
         "hyrl_mj.simulation.way_runs"

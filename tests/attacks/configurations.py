@@ -49,7 +49,7 @@ SETTINGS: dict[str, tuple[Any, ...]] = {
     "task": ("unit_square", "unit_circle ", "UNIT_CIRCLE", 5, "a.py", "../..", LONG),
     "preset": ("quick", "Fast", 5, LONG),
     "seed": (-1, 2**32, 1.5, NAN, -HUGE, 10**400),
-    "noise": (-0.1, NAN, INF, -INF, 1e308, 100, 3.2),
+    "eps": (-0.1, NAN, INF, -INF, 1e308, 100, 3.2),
     "horizon": (0, -0.5, NAN, INF, -INF),
     "stage1": ("abc", None, [], {}, {"algorithm": "ppo"}, 3),
     "stage6": ("abc", None, [], {}, {"algorithm": "ppo"}, 3),

@@ -24,11 +24,11 @@ def draw_extended_sets(shown: ShownRun, path: Path | None = None) -> Figure:
     task, sets = shown.task, shown.sets
     charts.check_drawable(task)
     horizon = f", T = {sets.horizon:.2g} s" if sets.horizon else ""
-    title = f"extended sets for noise up to eps = {sets.noise:g} {task.noise_on()[1]}{horizon}"
+    title = f"extended sets for noise up to eps = {sets.eps:g} {task.noise_on()[1]}{horizon}"
     # The nodes (N,) that several sets hold.
     shared = np.asarray(np.sum([members.mask for members in sets.sets], axis=0) > 1)
     ring = charts.is_ring(task.chart)
-    enlarged = not ring and len(shown.critical.points) > 0 and sets.noise > 0
+    enlarged = not ring and len(shown.critical.points) > 0 and sets.eps > 0
     with style.drawing(path, 5.6, shown.section, title) as figure:
         panels = figure.subplots(1, 1 + enlarged, squeeze=False).ravel()
         for i, mode in enumerate(sets.modes):
@@ -84,7 +84,7 @@ def _set_plane(panel: Axes, shown: ShownRun, shared: np.ndarray) -> None:
 
 def _enlarge(whole: Axes, near: Axes, shown: ShownRun) -> None:
     """Shows four noise bounds around M* in the second panel, with the width that noise requires."""
-    section, points, eps = shown.section, shown.critical.points, shown.sets.noise
+    section, points, eps = shown.section, shown.critical.points, shown.sets.eps
     low = np.maximum(points.min(axis=0) - 4 * eps, section.chart.low)
     high = np.minimum(points.max(axis=0) + 4 * eps, section.chart.high)
     near.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), title="around M*")

@@ -101,7 +101,7 @@ def shown_policy(run: Run, noisy: HybridArc) -> ShownPolicy:
         section.partition(run.partition),
         noisy,
         tuple(overview_arcs(run.task, run.steady)),
-        tuple(policy_start_arcs(run.task, run.steady, s.noise, s.seed)),
+        tuple(policy_start_arcs(run.task, run.steady, s.eps, s.seed)),
     )
 
 
