@@ -191,7 +191,7 @@ def test_a_file_with_such_a_setting_is_refused(settings, tmp_path, name, value, 
 
     with pytest.raises(BadInput, match=r"start a new run|control characters") as refused:
         write_and_read()
-    words = ({"eps": "noise bound"}.get(name, name), "control characters")
+    words = (name, {"eps": "noise bound"}.get(name, name), "control characters")
     assert any(word in str(refused.value) for word in words)
 
 
