@@ -99,13 +99,13 @@ def measure(run: hyrl_mj.Run, count: int) -> dict[str, str]:
     noises = tuple(hyrl_mj.Noise(kind, eps) for kind in KINDS)
     starts = near.draw(task, eps, count, np.random.default_rng(0))
     # From the same starts, with the same signals in the same order.
-    attacks = attack(task, run.loops, starts, eps, Budget(rounds=1))
-    for name, loop in run.loops.items():
+    attacks = attack(task, run.controllers, starts, eps, Budget(rounds=1))
+    for name, loop in run.controllers.items():
         ends = noisy_episodes(task, near, {name: loop}, noises, count).counts
         lost = " / ".join(str(end.lost) for end in ends)
         row[f"{name} lost: {' / '.join(KINDS)} / attack"] = f"{lost} / {attacks[name].count.lost}"
     if (game := run.robustness.game) is not None:
-        for name in run.loops:
+        for name in run.controllers:
             score = game.scores[name][-1]
             row[f"{name}: proved, own q0, of what is open"] = (
                 f"{score.proved * score.winnable / score.open:.2%}"

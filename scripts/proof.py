@@ -45,7 +45,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     run = hyrl_mj.load_run(args.run)
-    task, eps, loop = run.task, run.settings.eps, run.loops["hyrl"]
+    task, eps, loop = run.task, run.settings.eps, run.controllers["hyrl"]
     grid = Grid.with_cells(task.chart, run.settings.lattice)
     game = Game(task, run.split, {"hyrl": loop}, eps, grid=grid)
     certificate = Certificate.certify(game, {"hyrl": loop})

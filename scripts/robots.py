@@ -69,7 +69,8 @@ def crashes_without_noise(run: hyrl_mj.Run) -> dict[str, int]:
     if not survived.any():
         raise SystemExit(f"{task.name}: the expert survives from nowhere")
     return {
-        name: int((~reached(task, loop, z) & survived).sum()) for name, loop in run.loops.items()
+        name: int((~reached(task, loop, z) & survived).sum())
+        for name, loop in run.controllers.items()
     }
 
 
@@ -84,7 +85,7 @@ def measure(made: Row, count: int, folder: Path) -> list[str]:
     run = hyrl_mj.load_run(folder / made.name)
     noises = tuple(hyrl_mj.Noise(kind, run.settings.eps) for kind in KINDS)
     row = [made.setting.task, str(made.seed)]
-    for loop, controller in run.loops.items():
+    for loop, controller in run.controllers.items():
         n = min(count, SHARE) if loop == "policy" else count
         regions = Regions(run.critical_set.points, near=True)
         for ends in noisy_episodes(run.task, regions, {loop: controller}, noises, n).counts:

@@ -21,7 +21,7 @@ def run(vehicle):
         task=vehicle,
         settings=SimpleNamespace(eps=0.1, seed=0, lattice=480),
         controller=controller,
-        loops={"policy": PolicyController(policy), "hyrl": controller},
+        controllers={"policy": PolicyController(policy), "hyrl": controller},
         critical_set=decisions(vehicle),
         split=halves(vehicle),
         why_no_game=None,

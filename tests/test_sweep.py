@@ -513,7 +513,7 @@ def test_episodes_are_the_same_with_a_pool(circle, doubled, monkeypatch):
     with hyrl_mj.using_pool(doubled):
         assert count() == plain
     assert doubled.jobs == 2 * 2 * 3
-    assert not cores.given()
+    assert not cores.has_pool()
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from planted_field import Driven, Field, along, followed, runs_along
 from hyrl_mj import BadInput
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.simulation import LoopSettings, closed_loop, windings
-from hyrl_mj.stages.ways import MOST_MODES, Ways
+from hyrl_mj.stages.ways import MOST_MODES, HomotopyClasses
 from hyrl_mj.tasks import ANY, LEFT, RIGHT, Outcome, number_of, pattern_of, sides, way_name
 from hyrl_mj.tasks.obstacles import MOST_OBSTACLES, islands, sides_of_paths
 
@@ -235,7 +235,7 @@ def test_modes_are_the_patterns_of_which_no_other_says_more():
     between = [past(field.posts[1:], [side], start=(1.6, 0.1)) for side in (LEFT, RIGHT)]
     behind = [(3.5, 0.5), (4, 0)]
     runs = runs_along(field, along(*starts, *between, behind))
-    ways = Ways.from_runs(field, runs, NO_PAIRS)
+    ways = HomotopyClasses.from_runs(field, runs, NO_PAIRS)
     assert ways.patterns.tolist() == [[LEFT, LEFT], [LEFT, RIGHT], [RIGHT, RIGHT]]
     assert ways.modes == (0, 2, 3), "in the order of their numbers"
     belongs = {
@@ -256,7 +256,7 @@ def test_modes_say_how_to_pass_what_no_start_has_to_pass_together():
     field = Field({"_a": (1, 0, 0.3), "_b": (3, 0, 0.3)})
     paths = to_the_middle(field.posts)
     runs = runs_along(field, along(*paths.values()))
-    ways = Ways.from_runs(field, runs, NO_PAIRS)
+    ways = HomotopyClasses.from_runs(field, runs, NO_PAIRS)
     assert ways.patterns.tolist() == [[LEFT, LEFT], [RIGHT, LEFT], [LEFT, RIGHT], [RIGHT, RIGHT]]
     belongs = {
         "L any": [1, 0, 1, 0], "R any": [0, 1, 0, 1], "any R": [0, 0, 1, 1], "any L": [1, 1, 0, 0],
@@ -269,7 +269,7 @@ def test_modes_do_not_say_together_what_hardly_any_run_does():
     many = [path for path in to_the_middle(field.posts).values() for _ in range(50)]
     rare = [(0, 0), (1, -1), (3, -1), (4, 0), (3, 1), (2, 0)]  # to the right of a, and to that of b
     runs = runs_along(field, along(*many, rare, samples=40))
-    ways = Ways.from_runs(field, runs, NO_PAIRS)
+    ways = HomotopyClasses.from_runs(field, runs, NO_PAIRS)
     assert ways.dropped == (number_of(np.array([[RIGHT, RIGHT]]))[0],)
     assert ways.patterns.tolist() == [[LEFT, LEFT], [RIGHT, LEFT], [LEFT, RIGHT]]
 
@@ -277,13 +277,13 @@ def test_modes_do_not_say_together_what_hardly_any_run_does():
 def test_without_a_decision_there_is_no_mode():
     field = Field({"_a": (1, 0, 0.3)})
     runs = runs_along(field, along([(0, 0), (1, 1), (4, 0)], [(0, 0.1), (1, 1), (4, 0)]))
-    assert Ways.from_runs(field, runs, (np.array([0]), np.array([1]))).modes == ()
+    assert HomotopyClasses.from_runs(field, runs, (np.array([0]), np.array([1]))).modes == ()
 
 
 def test_a_post_that_all_pass_on_one_side_is_in_no_pattern():
     field = Field(row(2))
     runs = runs_along(field, along(*(past(field.posts, (side, LEFT)) for side in (LEFT, RIGHT))))
-    ways = Ways.from_runs(field, runs, NO_PAIRS)
+    ways = HomotopyClasses.from_runs(field, runs, NO_PAIRS)
     assert ways.patterns.tolist() == [[LEFT, ANY], [RIGHT, ANY]]
     assert field.mode_name(ways.modes[1]).endswith("(right of a)")
 
@@ -295,7 +295,7 @@ def test_a_way_that_hardly_any_node_goes_is_no_mode(rare, kept):
     many = [past(field.posts, (side, side)) for side in (LEFT, RIGHT) for _ in range(99)]
     paths = along(*many, *few, samples=40)
     runs = runs_along(field, paths)
-    ways = Ways.from_runs(field, runs, NO_PAIRS)
+    ways = HomotopyClasses.from_runs(field, runs, NO_PAIRS)
     number = int(number_of(np.array([[RIGHT, LEFT]]))[0])
     assert (number in ways.modes) == kept
     assert ways.dropped == (() if kept else (number,))
@@ -307,7 +307,7 @@ def test_nodes_inside_of_walls_make_no_way_rare():
     paths = [past(field.posts, (side,)) for side in (LEFT, RIGHT)] + [[(4, 0), (4, 0)]] * 400
     runs = runs_along(field, along(*paths, samples=40), np.arange(402) < 2)
     alive = np.arange(402) < 2
-    ways = Ways.from_runs(field, replace(runs, alive=alive, arrived=alive), NO_PAIRS)
+    ways = HomotopyClasses.from_runs(field, replace(runs, alive=alive, arrived=alive), NO_PAIRS)
     assert ways.modes == (0, 1)
     assert ways.dropped == ()
 
@@ -316,7 +316,7 @@ def test_only_runs_that_arrive_make_modes():
     field = Field(row(2))
     paths = along(*(past(field.posts, way) for way in product((LEFT, RIGHT), repeat=2)))
     arrived = np.array([True, False, True, True])
-    ways = Ways.from_runs(field, runs_along(field, paths, arrived), NO_PAIRS)
+    ways = HomotopyClasses.from_runs(field, runs_along(field, paths, arrived), NO_PAIRS)
     assert [LEFT, RIGHT] not in ways.patterns.tolist()
     assert len(ways.modes) == 3
     assert ways.arriving
@@ -326,7 +326,7 @@ def test_if_nothing_arrives_all_runs_show_ways():
     field = Field(row(2))
     paths = along(*(past(field.posts, way) for way in product((LEFT, RIGHT), repeat=2)))
     runs = runs_along(field, paths, np.zeros(4, dtype=bool))
-    ways = Ways.from_runs(field, runs, NO_PAIRS)
+    ways = HomotopyClasses.from_runs(field, runs, NO_PAIRS)
     assert len(ways.modes) == 4
     assert not ways.arriving
     assert ways.works(runs).all()
@@ -338,10 +338,10 @@ def test_more_ways_than_modes_are_one_sentence(posts):
     patterns = [*product((LEFT, RIGHT), repeat=posts)]
     runs = runs_along(field, along(*(past(field.posts, way) for way in patterns)))
     if 2**posts <= MOST_MODES:
-        assert len(Ways.from_runs(field, runs, NO_PAIRS).modes) == 2**posts
+        assert len(HomotopyClasses.from_runs(field, runs, NO_PAIRS).modes) == 2**posts
         return
     with pytest.raises(
         BadInput, match=r"field has 64 ways, .* at most 32 modes: .*direction"
     ) as error:
-        Ways.from_runs(field, runs, NO_PAIRS)
+        HomotopyClasses.from_runs(field, runs, NO_PAIRS)
     assert "\n" not in str(error.value)

@@ -170,7 +170,7 @@ class EnvironmentPlant:
         self._state[np.ix_(rows, self.spec.qpos)] = checked("qpos", qpos, nq, rows)
         self._state[np.ix_(rows, self.spec.qvel)] = checked("qvel", qvel, nv, rows)
         self._unstable[rows], self._open[rows] = False, True
-        seen, depths = self._pool.spread("rest", self._state[rows])
+        seen, depths = self._pool.scatter("rest", self._state[rows])
         blocked = depths > self.spec.depth
         outcome = np.where(blocked, Outcome.CRASHED, Outcome.RUNNING)
         nothing = np.zeros((len(rows), 2))
@@ -194,7 +194,7 @@ class EnvironmentPlant:
         if not len(rows):
             return
         if self._written:
-            states, seen, reports = self._pool.spread("branch", self._state[rows], u)
+            states, seen, reports = self._pool.scatter("branch", self._state[rows], u)
         else:
             if self.spec.wrapped:
                 self._sense(rows[self._open[rows]])

@@ -41,7 +41,7 @@ class Pool:
         # Runs of plants that nobody has any more: places (n,), numbers (n,), and which are played (n,) bool.
         self.left: deque[tuple[np.ndarray, np.ndarray, np.ndarray]] = deque()
 
-    def spread(self, what: str, *values: np.ndarray) -> Arrays:
+    def scatter(self, what: str, *values: np.ndarray) -> Arrays:
         """Has all processes do something with values (k, ...): "rest" or "branch"; see `Stage`."""
         return self.ask(what, self.places(len(values[0])), *values)
 

@@ -219,14 +219,14 @@ class EnvironmentTask(Task):
     def at(self, z: np.ndarray) -> np.ndarray:
         rest = np.tile([0.0, 0.0, float(Outcome.RUNNING)], (len(z), 1))
         return np.column_stack(
-            [z, self._pool.spread("rest", self.specification.state_at(z))[0], rest]
+            [z, self._pool.scatter("rest", self.specification.state_at(z))[0], rest]
         )
 
     def _at_rest(self, z: np.ndarray) -> np.ndarray:
         """Returns what a robot at rest at chart points (n, d) observes (n, o)."""
         if (affine := self.specification.affine) is not None:
             return np.asarray(np.column_stack([z, np.ones(len(z))]) @ affine)
-        return self._pool.spread("rest", self.specification.state_at(z))[0]
+        return self._pool.scatter("rest", self.specification.state_at(z))[0]
 
     def with_z(self, measured: np.ndarray, z: np.ndarray) -> np.ndarray:
         """Returns measurements (n, p) with what a robot at rest at chart points z (n, d) would observe.
@@ -277,7 +277,7 @@ class EnvironmentTask(Task):
     def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
         z = super().starts(n, rng)
         for _ in range(200):
-            _, depths = self._pool.spread("rest", self.specification.state_at(z))
+            _, depths = self._pool.scatter("rest", self.specification.state_at(z))
             inside = np.flatnonzero(depths > self.specification.depth)
             if not len(inside):
                 return z

@@ -199,7 +199,7 @@ def moving(pool: Pool, spec: EnvironmentSpec) -> tuple[np.ndarray, np.ndarray | 
     """Returns which columns of an observation at rest follow the chart (o,) bool, and `affine` of a spec."""
     shape = EPISODES * (spec.dimension + 1), spec.dimension
     z = np.random.default_rng(0).uniform(spec.start_low, spec.start_high, shape)
-    seen, _ = pool.spread("rest", spec.state_at(z))
+    seen, _ = pool.scatter("rest", spec.state_at(z))
     one = np.column_stack([z, np.ones(len(z))])
     fit = np.linalg.lstsq(one, seen, rcond=None)[0]
     exact = _rounds(np.abs(one @ fit - seen), seen).all()
@@ -218,7 +218,7 @@ def _runs(
     """
     rng = np.random.default_rng(seed)
     states = spec.state_at(rng.uniform(spec.start_low, spec.start_high, (3 * n, spec.dimension)))
-    _, depths = pool.spread("rest", states)
+    _, depths = pool.scatter("rest", states)
     states = states[np.argsort(depths > spec.depth, kind="stable")[:n]]
     plant = EnvironmentPlant(spec, pool, None, n)
     plant.set_state(states[:, spec.qpos], states[:, spec.qvel])
@@ -294,7 +294,7 @@ def goes_on(pool: Pool, spec: EnvironmentSpec, of_chart: bool = False) -> bool:
             return True
         written = spec.state_at(spec.z(before)) if of_chart else before
         try:
-            after, seen, report = pool.spread("branch", written, u[going])
+            after, seen, report = pool.scatter("branch", written, u[going])
         except BadInput:
             return False
         success, outcome = spec.criterion.judged(report)

@@ -143,11 +143,11 @@ def noisy_episodes(
         for n in (min(BATCH, count - first),)
     ]
     # The plants are used again: new ones for each batch would fragment the memory.
-    plants = {} if cores.given() else {n: task.plant(n) for n in {batch.n for batch in batches}}
+    plants = {} if cores.has_pool() else {n: task.plant(n) for n in {batch.n for batch in batches}}
     counts: list[EpisodeCount] = []
     ends: dict[tuple[str, float], dict[str, Ends]] = {}
     with progress_bar(None, "noisy episodes", "episodes", count * len(pairs)) as progress:
-        ended = cores.spread(partial(_play, plants), batches)
+        ended = cores.in_processes(partial(_play, plants), batches)
         for noise, name in pairs:
             played = []
             for first, batch in zip(firsts, ended):  # noqa: B905 - the next pair goes on

@@ -136,7 +136,7 @@ def retrain_stage(run: Run, say: Say) -> None:
     work = partial(_retrained, s, ground_of, warm_start, parts, table_of, run.path / "logs")
     done: list[tuple[ModePolicy, ModeResult]] = []
     if run.task.mirror is None:
-        done += cores.spread(work, sets.modes)
+        done += cores.in_processes(work, sets.modes)
     else:  # the mirror image of the policy of one mode may do for the next
         for q in sets.modes:
             done.append(work(q, tuple(done)))
@@ -174,7 +174,7 @@ def _retrained(
 
 def examine_stage(run: Run, say: Say, options: ExamineOptions = USUAL) -> None:
     """Examines policy and hybrid controller under noise; all files are written at the end."""
-    subject = replace(subject_of(run, run.loops, run.split), alike=run.keeps_agent)
+    subject = replace(subject_of(run, run.controllers, run.split), alike=run.keeps_agent)
     budget = options.budget(subject.effort, subject.exact)  # a wrong one is refused before the work
     found = examine(subject, options, budget)
     for name, arc in found.arcs.items():

@@ -88,9 +88,9 @@ def noisy_arcs(
         usual = LATTICE[task.chart.dimension]
         cells = max(run.settings.lattice or usual, CURVE_CELLS[task.chart.dimension])
         grid = lattice_grid(task, cells)
-        game = Game(task, run.split, run.loops, bound, grid=grid)
+        game = Game(task, run.split, run.controllers, bound, grid=grid)
     arcs = {}
-    for name, loop in run.loops.items():
+    for name, loop in run.controllers.items():
         for q0 in q0s if name == "hyrl" else (None,):
             signal: AnyNoise
             if sensor is not None:

@@ -227,7 +227,7 @@ class Run:
         return HybridController(self.task, mode_policies, flow_sets, starts)
 
     @cached_property
-    def loops(self) -> dict[str, policies.Controller]:
+    def controllers(self) -> dict[str, policies.Controller]:
         """The controllers by name: the policy alone, and the hybrid controller."""
         return {"policy": policies.PolicyController(self.policy), "hyrl": self.controller}
 

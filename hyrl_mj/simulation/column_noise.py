@@ -146,7 +146,7 @@ def column_noise(
         kept = np.clip(raw, *np.quantile(raw[used], [(1 - share) / 2, (1 + share) / 2]))
         slow, drift, rate, unsure = _drift(np.where(used, kept, nan), dt, tiny)
         left = raw - slow
-        sigma, bound, uniform = _spread(left[used], quantum, share, tiny, drift)
+        sigma, bound, uniform = _noise_left(left[used], quantum, share, tiny, drift)
         repeated = _repeated(late + slow, left[used], sigma, quantum, tiny)
         moves = repeated < 0.5
         by_chance = float(np.mean(repeated[moves])) if moves.any() else 1.0
@@ -423,7 +423,7 @@ def _means(values: np.ndarray, length: int) -> np.ndarray:
     return np.interp(np.arange(len(blocks)), some, np.nansum(blocks[some], axis=1) / counts[some])
 
 
-def _spread(
+def _noise_left(
     left: np.ndarray, quantum: float, share: float, tiny: float, drift: float
 ) -> tuple[float, float, bool]:
     """Returns deviation and bound of noise, without what rounding adds, and whether it is uniform."""

@@ -19,7 +19,7 @@ from hyrl_mj.sets import GridSet, Nodes, check_points, resolving
 from hyrl_mj.simulation import WayRuns, policy_runs, way_runs
 from hyrl_mj.stages import strips
 from hyrl_mj.stages.refinement import refined, thinned
-from hyrl_mj.stages.ways import Ways
+from hyrl_mj.stages.ways import HomotopyClasses
 from hyrl_mj.tasks import ANY, Outcome, Task, number_of
 
 # The neighbourhood of M* is at least this many cells wide, and as wide as the longest hop in one sample.
@@ -157,7 +157,7 @@ def make_partition(
         def near(rows: np.ndarray) -> np.ndarray:
             return strips.around_walls(task, nodes, (a, b), first.alive, rows, width) <= width
 
-    ways = Ways.from_runs(task, first, neighbours, near, settings)
+    ways = HomotopyClasses.from_runs(task, first, neighbours, near, settings)
     modes = ways.modes if len(points) else ()
 
     def tell(rows: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 from hyrl_mj.learning import WaySettings
 from hyrl_mj.policies import Policy, PolicyController
 from hyrl_mj.simulation import Rollout, Sample, Signal, WayRuns, closed_loop, way_runs
-from hyrl_mj.stages.ways import Ways
+from hyrl_mj.stages.ways import HomotopyClasses
 from hyrl_mj.tasks import Outcome, Task
 
 
@@ -36,7 +36,7 @@ def critical_points(
     """
     rollout = way_runs(task, policy, nodes, label="critical set")
     runs, paths = WayRuns.from_rollout(task, rollout), _paths(task, rollout)
-    ways = Ways.from_runs(task, runs, neighbours, settings=settings)
+    ways = HomotopyClasses.from_runs(task, runs, neighbours, settings=settings)
     works = ways.works(runs)
     if not works.any():
         return np.empty((0, task.chart.dimension))
@@ -122,7 +122,7 @@ def _paths(task: Task, rollout: Rollout) -> np.ndarray:
 def _bisected(
     task: Task,
     policy: Policy,
-    ways: Ways,
+    ways: HomotopyClasses,
     a: _Side,
     b: _Side,
     resolution: float,

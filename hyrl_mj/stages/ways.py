@@ -20,7 +20,7 @@ Near = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
-class Ways:
+class HomotopyClasses:
     """The modes of a policy: the patterns of the ways that its runs go.
 
     A pattern holds, for each obstacle, whether it is passed on its `LEFT`, on its `RIGHT`, or `ANY` of them:
@@ -56,7 +56,7 @@ class Ways:
         neighbours: tuple[np.ndarray, np.ndarray],
         near: Near | None = None,
         settings: WaySettings = WaySettings(),
-    ) -> Ways:
+    ) -> HomotopyClasses:
         """Returns the ways of runs from all nodes of a chart.
 
         They are those of the runs that arrive; if hardly any does, those of all runs.
@@ -93,7 +93,9 @@ class Ways:
                     half[k] = min(half[k], least)
             seen = sides(_angles(passing, end), half)[counted]
             decides = (seen == LEFT).any(axis=0) & (seen == RIGHT).any(axis=0)
-        found = Ways(np.empty((0, len(decides)), dtype=int), (), (), end, half, decides, True)
+        found = HomotopyClasses(
+            np.empty((0, len(decides)), dtype=int), (), (), end, half, decides, True
+        )
         patterns = found.of_runs(runs)[counted]
         kept, dropped = _modes(patterns, settings.least_share * runs.alive.sum())
         if len(kept):
@@ -109,7 +111,7 @@ class Ways:
         )
         order = np.argsort(numbers[0])
         modes, gone = (tuple(int(q) for q in values) for values in (numbers[0][order], numbers[1]))
-        return Ways(kept[order], modes, gone, end, half, decides, runs.arriving)
+        return HomotopyClasses(kept[order], modes, gone, end, half, decides, runs.arriving)
 
     def of_runs(self, runs: WayRuns) -> np.ndarray:
         """Returns the patterns (n, K) of runs."""

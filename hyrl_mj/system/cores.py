@@ -62,12 +62,12 @@ def using_pool(pool: Pool) -> Iterator[None]:
         _pool.reset(token)
 
 
-def given() -> bool:
+def has_pool() -> bool:
     """Returns whether there is a pool."""
     return _pool.get() is not None
 
 
-def spread(work: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[Result]:
+def in_processes(work: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[Result]:
     """Yields the results of jobs in their order: from the pool if there is one, else one after the other."""
     pool = _pool.get()
     yield from map(work, jobs) if pool is None else pool.map(partial(_alone, work), jobs)
