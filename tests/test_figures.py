@@ -96,9 +96,9 @@ def test_it_is_written_as_png_and_as_pdf_of_one_page(tmp_path, monkeypatch, task
         if name == "extended_sets" and task is VEHICLE:
             colour = style.mode_tint(mode)
         assert len(where(path, colour)) > 20, "each mode is there in its colour"
-    first = path.with_suffix(".pdf").read_bytes()
-    draw(name, task, path)
-    assert path.with_suffix(".pdf").read_bytes() == first, "the same picture is the same file"
+    if name == "overview":
+        draw(name, task, path)
+        assert path.with_suffix(".pdf").read_bytes() == pdf, "the same picture is the same file"
 
 
 @TASKS

@@ -129,7 +129,10 @@ def command_line(vehicle, monkeypatch, tmp_path):
         "hyrl": ideal_controller(vehicle, 0.154, clear=1.004),
     }
     run = SimpleNamespace(
-        task=vehicle, controllers=loops, latest_path=lambda name: tmp_path / f"{name}.npz", path=tmp_path
+        task=vehicle,
+        controllers=loops,
+        latest_path=lambda name: tmp_path / f"{name}.npz",
+        path=tmp_path,
     )
     opened = replace(parsing.KINDS[Run], read=lambda path: run)
     monkeypatch.setitem(parsing.KINDS, Run, opened)
