@@ -456,13 +456,19 @@ def test_what_it_lacks_is_said(circle):
         Answers.ask(lattice, loop, np.zeros(1))
 
 
-def test_a_model_of_other_observations_or_actions_is_refused(circle):
+def test_a_model_of_other_observations_or_actions_is_refused(circle, tmp_path):
     model = PPO("MlpPolicy", TaskVecEnv(BatchedEnv(circle, 1)), n_steps=64)
     assert from_callable(model, circle).act(np.ones((2, 1))).shape == (2, 1)
     for task, why in (("gate", r"observes \(2,\), and gate gives \(4,\)"), ("vehicle", "gives")):
         with pytest.raises(BadInput, match=why):
             from_callable(model, hyrl_mj.get_task(task))
     env = VecNormalize(TaskVecEnv(BatchedEnv(circle, 1)))
+    trained = PPO("MlpPolicy", env, n_steps=8, batch_size=8, device="cpu").learn(8)
+    trained.save(tmp_path / "model.zip")
+    with pytest.raises(
+        BadInput, match="was trained under VecNormalize"
+    ):  # its statistics are not in it
+        from_callable(PPO.load(tmp_path / "model.zip", device="cpu"), circle)
     with pytest.raises(BadInput, match="was trained under VecNormalize"):
         from_callable(PPO("MlpPolicy", env, n_steps=64), circle)
     model.action_space = gym.spaces.Box(-2, 2, (1,))

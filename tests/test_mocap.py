@@ -312,3 +312,13 @@ def test_a_rule_without_bodies_is_refused(vehicle):
     task = type("Wrong", (type(vehicle),), {"mocap": lambda self, qpos: qpos, "source": None})()
     with pytest.raises(BadInput, match="has no mocap body"):
         check_task(task)
+
+
+def test_a_keyframe_that_places_a_mocap_body_elsewhere_is_refused():
+    keyed = XML.replace("SENSORS", "").replace(
+        '<key ctrl="1 0 2"/>', '<key ctrl="1 0 2" mpos="1 0 0.1 2 1 0.1"/>'
+    )
+    with pytest.raises(BadInput, match=r"places mocap body hand at \[2\.0, 1\.0, 0\.1\]"):
+        Plant(mujoco.MjModel.from_xml_string(keyed), ("lateral",), 1)
+    same = keyed.replace("2 1 0.1", "2 0 0.1")
+    assert Plant(mujoco.MjModel.from_xml_string(same), ("lateral",), 1).n == 1

@@ -194,8 +194,9 @@ def test_gaps_and_uneven_times_are_said_and_are_no_lost_samples(tmp_path):
     assert "2 gaps in time of up to 5.05 s" in " ".join(found.remarks)
     assert found.text == f"uniform {found.worst.bound:.3g} + delay 2"
     log["t"] = log["t"] + np.random.default_rng(0).uniform(0, 0.02, 6000)
-    (remark,) = noise_from_log(write(tmp_path / "b.csv", log)).remarks
-    assert "a sample is taken as 0.0499 s" in remark
+    taken, counted = noise_from_log(write(tmp_path / "b.csv", log)).remarks
+    assert "a sample is taken as 0.0499 s" in taken
+    assert "delay and held samples are counted in samples of this log, of 0.0499 s" in counted
 
 
 def test_few_rows_are_said(tmp_path):
@@ -306,3 +307,49 @@ def test_a_log_without_times_takes_them_as_an_option(of):
     log = planted(0, 0.05, drift=(0.05, 0.01))
     del log["t"]
     assert of(log, dt=0.05).drift_rate == pytest.approx(0.01, rel=0.1)
+
+
+def test_what_is_held_while_the_reference_moves_is_held_from_the_first_row_on(tmp_path):
+    slow = planted(0, 0.01, uniform=0.02, seconds=60)
+    slow["x"] = np.repeat(slow["x"][::10], 10)  # ten rows a measurement
+    (column,) = noise_from_log(write(tmp_path / "slow.csv", slow)).columns
+    assert (column.held, column.bound) == (9, pytest.approx(0.02, rel=0.1))
+    assert np.abs(column.correlations[1:10]).max() == 0, "no two samples are so near to each other"
+    late = planted(0, 0.05, uniform=0.02)
+    late["x"][:20] = late["x"][0]
+    (column,) = noise_from_log(write(tmp_path / "late.csv", late)).columns
+    assert column.bound == pytest.approx(0.02, rel=0.1)
+
+
+def test_beside_a_quantum_that_is_larger_both_reach_as_far_as_the_errors(tmp_path):
+    log, rng = planted(0, 0.05, uniform=0.0), np.random.default_rng(0)
+    log["x"] = np.round((log["x_ref"] + rng.normal(0, 0.005, len(log["t"]))) / 0.03) * 0.03
+    (column,) = noise_from_log(write(tmp_path / "log.csv", log)).columns
+    assert column.quantum == pytest.approx(0.03)
+    assert np.mean(np.abs(log["x"] - log["x_ref"]) > column.bound + 0.015) < 0.002
+
+
+def test_angles_that_jump_by_a_turn_are_no_noise(tmp_path):
+    log, rng = planted(0, 0.05, uniform=0.0), np.random.default_rng(0)
+    true = 3 * log["x_ref"]
+    log["x"], log["x_ref"] = (
+        (values + np.pi) % (2 * np.pi) - np.pi
+        for values in (true + rng.uniform(-0.1, 0.1, len(true)), true)
+    )
+    path = write(tmp_path / "log.csv", log)
+    with pytest.raises(BadInput, match="give --turn x"):
+        noise_from_log(path)
+    (column,) = noise_from_log(path, turn=["x"]).columns
+    assert column.bound == pytest.approx(0.1, rel=0.1)
+    moved = planted(0, 0.05, uniform=4.0)  # [m]
+    assert noise_from_log(write(tmp_path / "far.csv", moved)).worst.bound == pytest.approx(
+        4.0, rel=0.1
+    )
+
+
+@pytest.mark.parametrize("factor", ["abc", None, True])
+def test_a_factor_is_a_number(factor, tmp_path):
+    with pytest.raises(BadInput, match="give a factor"):
+        noise_from_log(
+            write(tmp_path / "log.csv", planted(0, 0.05, uniform=0.1)), scale={"x": factor}
+        )

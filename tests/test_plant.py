@@ -354,3 +354,15 @@ def test_a_forked_process_goes_on_to_the_bit_and_ends(task, threads):
 def test_a_number_of_copies_that_is_none_is_refused(vehicle, n):
     with pytest.raises(BadInput, match=r"the number of copies of a robot .* from 1 to"):
         vehicle.plant(n)
+
+
+@pytest.mark.parametrize("timestep", ["0.03", "0.07", "0.2"])
+def test_a_sample_of_no_whole_number_of_steps_is_refused(timestep):
+    xml = (
+        f'<mujoco model="odd"><option timestep="{timestep}"/><custom><numeric name="sample_time" '
+        'data="0.05"/></custom><worldbody><body><joint name="x" type="slide"/><geom size="1"/></body>'
+        '</worldbody><actuator><velocity name="v" joint="x" ctrlrange="-1 1"/></actuator><sensor>'
+        '<jointpos joint="x"/></sensor></mujoco>'
+    )
+    with pytest.raises(BadInput, match=rf"0\.05 s is no multiple of the physics step {timestep} s"):
+        Plant(mujoco.MjModel.from_xml_string(xml), ("v",), 1)

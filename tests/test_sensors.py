@@ -1,8 +1,10 @@
 """Sensors: each part does what it says, together they stay within their bound, and runs are made for them."""
 
 import shutil
+from copy import copy
 from dataclasses import dataclass
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from environments import Puck
@@ -14,7 +16,17 @@ import hyrl_mj
 from hyrl_mj import BadInput, Noise, RunOptions, Sensor, cli
 from hyrl_mj.pipeline import ExamineOptions, examine_run
 from hyrl_mj.pipeline.runs import settings_of
-from hyrl_mj.simulation import KINDS, SENSOR, LoopSettings, closed_loop, covers_sensor, noise_of
+from hyrl_mj.simulation import (
+    KINDS,
+    SENSOR,
+    LoopSettings,
+    Signal,
+    closed_loop,
+    covers_sensor,
+    noise_of,
+    register_noise,
+)
+from hyrl_mj.simulation.sensors import Part
 from hyrl_mj.viz import beginning
 
 VEHICLE, CIRCLE = "vehicle", "unit_circle"
@@ -190,7 +202,103 @@ def test_what_cannot_be_sensed_is_refused():
     assert Sensor.parse("bias 0.1").on(task)[0] == 0.1
 
 
+@register_noise
+class Restless(Signal):
+    """Noise with a generator that no seed decides."""
+
+    kind = "restless"
+
+    def reset(self, n, rng):
+        self.own = np.random.default_rng()
+
+    def sample(self, now):
+        return self.own.uniform(-self.bound, self.bound, now.measurement.shape) * self.shares
+
+
+@register_noise
+class Growing(Signal):
+    """Noise that raises its own bound."""
+
+    kind = "growing"
+
+    def sample(self, now):
+        self.bound = self.bound * 1.1
+        return np.zeros_like(now.measurement)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("restless 0.05 + delay 1", "other values where it begins anew with the same seed"),
+        ("growing 0.05 + bias 0.05", "let sample\\(\\) leave bound and shares as they are"),
+    ],
+)
+def test_noise_of_users_is_checked_inside_of_a_sum_and_in_an_environment(text, says):
+    with pytest.raises(BadInput, match=says):
+        played(text)
+    if text.startswith("restless"):
+        with pytest.raises(BadInput, match=says):
+            gym.make("hyrl_mj/ObstacleAvoidance-v0", noise=Noise("restless", 0.05))
+
+
+def test_a_late_sensor_needs_a_measurement_that_begins_with_the_chart():
+    swapped = copy(hyrl_mj.get_task(VEHICLE))
+    swapped.z = lambda measured: measured[:, ::-1]
+    with pytest.raises(BadInput, match="let the measurement begin with them"):
+        Sensor.parse("uniform 0.01 + delay 2").against(swapped, None)
+
+
+def test_what_hides_the_whole_chart_is_refused_wherever_it_is_used(tmp_path):
+    vehicle = hyrl_mj.get_task(VEHICLE)
+    with pytest.raises(BadInput, match="hides the whole state space"):
+        Sensor.parse("uniform 50").against(vehicle, None)
+    off = np.random.default_rng(0).uniform(-50, 50, 200)
+    rows = [f"{0.05 * k:.2f},{k + off[k]},{k}" for k in range(200)]
+    (tmp_path / "far.csv").write_text("\n".join(["t,y,y_ref", *rows]))
+    with pytest.raises(BadInput, match="hides the whole state space"):
+        noise_of(vehicle, f"log {tmp_path / 'far.csv'}", 0.0).against(vehicle, None)
+
+
+def test_sums_tell_where_they_act():
+    for text in ("uniform 0.05 + delay 1", "uniform 0.05"):
+        with pytest.raises(BadInput, match="leave all coordinates out"):
+            noise_of(hyrl_mj.get_task(VEHICLE), text, 0.0, everywhere=True)
+    with pytest.raises(BadInput, match="leave all coordinates out"):
+        Noise("sensor", 0.1, everywhere=True).against(hyrl_mj.get_task(VEHICLE), None)
+
+
+def test_parts_made_in_python_are_checked_as_texts_are():
+    with pytest.raises(BadInput, match="a whole number of samples"):
+        Part("delay", 1.5)
+    with pytest.raises(BadInput, match="more than one delay"):
+        Sensor((Part("delay", 1), Part("delay", 3)))
+    with pytest.raises(BadInput, match="is no text"):
+        Sensor.parse(None)
+    with pytest.raises(BadInput, match="give a text"):
+        hyrl_mj.run(VEHICLE, noise=Noise("uniform", 0.1))
+    given = RunOptions(noise=Sensor.parse("bias 0.04"))
+    assert settings_of(hyrl_mj.get_task(VEHICLE), given).sensor == "bias 0.04"
+
+
+def test_words_of_sensors_are_no_kinds_of_noise():
+    with pytest.raises(BadInput, match="'delay' means something else"):
+        register_noise(type("Late", (Signal,), {"kind": "delay"}))
+
+
 # ---- logs
+
+
+def test_an_angle_in_a_log_is_one_where_the_chart_says_so(tmp_path):
+    rng, k = np.random.default_rng(0), np.arange(4000)
+    true = 0.03 * k + 0.5 * np.sin(k / 15)
+    told = np.append(np.full(2, true[0]), true[:-2]) + 0.05 + rng.uniform(-0.02, 0.02, len(k))
+    turns = [(values % (2 * np.pi)).tolist() for values in (told, true)]
+    lines = [f"{0.05 * i:.2f},{a},{b}" for i, a, b in zip(k, *turns, strict=True)]
+    path = tmp_path / "theta.csv"
+    path.write_text("\n".join(["t,theta,theta_ref", *lines]))
+    noise = noise_of(hyrl_mj.get_task(CIRCLE), f"log {path}", 0.0)
+    assert noise.bound == pytest.approx(0.07, rel=0.05)
+    assert noise.log.worst.delay == 2
 
 
 @pytest.fixture
@@ -204,7 +312,7 @@ def log(tmp_path):
 
 def test_each_run_plays_a_window_of_a_log(log):
     task = hyrl_mj.get_task(VEHICLE)
-    noise = noise_of(f"log {log}", 0.0)
+    noise = noise_of(task, f"log {log}", 0.0)
     z0 = np.tile([0.0, 0.9], (40, 1))
     options = LoopSettings(record=True, quiet=True, steps=30)
     loop = hyrl_mj.policies.PolicyController(Fixed())
@@ -225,9 +333,11 @@ def test_each_run_plays_a_window_of_a_log(log):
 
 def test_what_is_no_log_of_a_task_is_refused(log, tmp_path):
     with pytest.raises(BadInput, match="rename the columns"):
-        noise_of(f"log {log}", 0.0).against(hyrl_mj.get_task(CIRCLE), None)
+        noise_of(hyrl_mj.get_task(CIRCLE), f"log {log}", 0.0).against(
+            hyrl_mj.get_task(CIRCLE), None
+        )
     with pytest.raises(BadInput, match="cannot be read"):
-        noise_of(f"log {tmp_path / 'none.csv'}", 0.0)
+        noise_of(hyrl_mj.get_task(CIRCLE), f"log {tmp_path / 'none.csv'}", 0.0)
     with pytest.raises(BadInput, match="hyrl-mj noise LOG"):
         hyrl_mj.run(VEHICLE, noise=f"log {log}", out=tmp_path / "run")
     assert not (tmp_path / "run").exists()

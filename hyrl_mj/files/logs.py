@@ -31,6 +31,8 @@ def read_log(
     Raises:
         BadInput: the file cannot be read, or something in it cannot be used.
     """
+    if not isinstance(path, str | Path):
+        raise BadInput(f"{path!r:.60} is no path of a file: {NEEDED}")
     reader = csv.reader(io.StringIO(_text(Path(path))), strict=True, skipinitialspace=True)
     try:
         header = [name.strip() for name in next(reader, [])]
@@ -51,6 +53,18 @@ def read_log(
     except csv.Error as error:
         raise BadInput(f"{path} is no CSV file ({brief(error)}): {NEEDED}") from None
     return {name: np.array(column) for name, column in zip(names, values, strict=True)}
+
+
+def names_of(path: str | Path) -> list[str]:
+    """Returns the names of the columns of a CSV file; raises `BadInput` as `read_log`."""
+    names: list[str] = []
+
+    def pick(header: Sequence[str]) -> Sequence[str]:
+        names.extend(header)
+        return ()
+
+    read_log(path, pick)
+    return names
 
 
 def _text(path: Path) -> str:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.ranges import Integer, Optional
-from hyrl_mj.simulation import NOT_STARTED, AnyNoise, Sample, drawn, signal_for
+from hyrl_mj.simulation import NOT_STARTED, AnyNoise, Sample, drawn, signal_for, try_signal
 from hyrl_mj.tasks import Outcome, Task, at_levels, check_finite
 
 # The most episodes side by side.
@@ -95,6 +95,7 @@ class BatchedEnv:
         threads = Integer(0, 1_024).checked("threads", threads)
         self.task, self.n, self.domain = task, n, domain
         self._noise = signal_for(noise, task, None)
+        try_signal(self._noise, task, n)
         self.max_steps = limit or task.max_steps
         self.plant = task.plant(n, threads)
         self.samples = np.zeros(n, dtype=int)  # of each episode so far

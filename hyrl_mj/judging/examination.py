@@ -15,7 +15,7 @@ from hyrl_mj.judging.game import MapClass, Maps, Robustness, compare
 from hyrl_mj.judging.worst_case import worst_case
 from hyrl_mj.policies import Controller
 from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.simulation import AttackSettings, HybridArc, noise_of, usual_kinds
+from hyrl_mj.simulation import SENSOR, AttackSettings, HybridArc, noise_of, usual_kinds
 from hyrl_mj.tasks import Effort, Task
 
 
@@ -141,7 +141,8 @@ def examine(
         count = subject.effort.episodes
     if count is not None and count < 1:
         raise BadInput(f"{count} episodes cannot be simulated: give at least 1")
-    noises = [noise_of(kind, eps, everywhere) for kind in options.noise or usual_kinds(task, eps)]
+    usual = [kind for kind in usual_kinds(task, eps) if not (everywhere and kind == SENSOR)]
+    noises = [noise_of(task, kind, eps, everywhere) for kind in options.noise or usual]
     game, maps = None, None
     if subject.playable:
         bounds = tuple(dict.fromkeys((0.0, eps / 2, eps)))

@@ -213,6 +213,43 @@ def sample_time(model: mujoco.MjModel) -> float:
     return float(numeric(model, "sample_time", 1)[0])
 
 
+def substeps(model: mujoco.MjModel) -> int:
+    """Returns the number of physics steps in a sample of the controller.
+
+    Raises:
+        BadInput: a sample is no whole number of them.
+    """
+    time, step = sample_time(model), float(model.opt.timestep)
+    if abs(time / step - round(time / step)) > 1e-6 or time / step < 0.5:
+        raise BadInput(
+            f"the sample time of {model_name(model)} of {time:g} s is no multiple of the physics step "
+            f"{step:g} s: change one of them"
+        )
+    return round(time / step)
+
+
+def keyed_mocap(model: mujoco.MjModel) -> str:
+    """Returns which mocap body the first keyframe places, and the remedy, as a sentence; "" if none.
+
+    Mocap bodies stand where the MJCF puts them, or where the task's `mocap` does.
+    """
+    for body in np.flatnonzero(model.body_mocapid >= 0) if model.nkey else ():
+        place, i = (
+            np.concatenate([model.body_pos[body], model.body_quat[body]]),
+            model.body_mocapid[body],
+        )
+        keyed = np.concatenate(
+            [model.key_mpos[0].reshape(-1, 3)[i], model.key_mquat[0].reshape(-1, 4)[i]]
+        )
+        if not np.allclose(keyed, place, atol=1e-9):
+            return (
+                f"the first keyframe of {model_name(model)} places mocap body "
+                f"{names(model, mujoco.mjtObj.mjOBJ_BODY)[body]} at {keyed[:3].tolist()}, and its pos is "
+                f"{place[:3].tolist()}: give the place as the body's pos and quat, or by mocap() of the task"
+            )
+    return ""
+
+
 def wrong_physics(model: mujoco.MjModel, version: str = mujoco.__version__) -> str:
     """Returns why a version of MuJoCo simulates a model wrongly, and the remedy; "" if it does not.
 

@@ -31,6 +31,11 @@ def remembers(model: mujoco.MjModel) -> str:
     return ""
 
 
+def unusable(model: mujoco.MjModel) -> str:
+    """Returns why a model cannot be simulated as it is meant, and the remedy; "" if it can."""
+    return compiled.wrong_physics(model) or compiled.keyed_mocap(model) or late_sensor(model)
+
+
 def late_sensor(model: mujoco.MjModel) -> str:
     """Returns which sensor holds or delays its values, and the remedy, as a sentence; "" if none does."""
     for i, name in enumerate(compiled.names(model, mujoco.mjtObj.mjOBJ_SENSOR)):

@@ -55,7 +55,7 @@ class Plant:
         mocap: compiled.Mocap | None = None,
         steady: bool = False,
     ):
-        if problem := compiled.wrong_physics(model) or memory.late_sensor(model):
+        if problem := memory.unusable(model):
             raise BadInput(problem)
         n = Integer(1, MOST).checked("the number of copies of a robot", n)
         self.n, self._threads, self._measure, self._control = n, threads, measure, control
@@ -66,7 +66,7 @@ class Plant:
         # checked here, and clamping would prevent backward steps.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
-        self.substeps = max(round(compiled.sample_time(model) / model.opt.timestep), 1)
+        self.substeps = compiled.substeps(model)
         self.low, self.high = input_limits(model, inputs, of_actuators=control is None)
         self._columns = [] if control else actuator_columns(model, inputs)
         limited = model.actuator_ctrllimited.astype(bool)[:, None]

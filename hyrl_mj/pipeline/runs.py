@@ -246,7 +246,13 @@ def settings_of(task: Task, options: RunOptions) -> Settings:
 def _settings(task: Task, options: RunOptions | AgentOptions, **changes: Any) -> Settings:
     """Returns the settings of the preset that options name."""
     eps, seed, horizon = options.eps, options.seed, options.horizon
-    sensor = options.noise
+    given: object = options.noise
+    if not (given is None or isinstance(given, str | Sensor)):
+        raise BadInput(
+            f"the noise {given!r:.60} cannot be used: give a text, as 'uniform 0.05 + delay 1', or a bound "
+            "by eps"
+        )
+    sensor = None if given is None else str(given)
     if task.sensor and not isinstance(task.sensor, str):
         raise BadInput(f"sensor of {task.name} is {task.sensor!r:.60}: give a text, as 'bias 0.1'")
     if task.sensor:  # what is wrong with it is said now

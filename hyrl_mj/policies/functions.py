@@ -224,10 +224,13 @@ def _predicting(model: Predicts, task: Task) -> FunctionPolicy | RememberingPoli
 def _check_model(model: Any, task: Task) -> None:
     """Raises `BadInput` if an SB3 model was trained on other observations or inputs than those of a task."""
     normalizer = getattr(model, "get_vec_normalize_env", lambda: None)()
-    if normalizer is not None and normalizer.norm_obs:
+    # A loaded model has no environment; it has kept what its last one observed beside VecNormalize.
+    kept = getattr(model, "get_env", lambda: None)() is None
+    kept = kept and getattr(model, "_last_original_obs", None) is not None
+    if kept or (normalizer is not None and normalizer.norm_obs):
         raise BadInput(
             "the model was trained under VecNormalize, and would be asked about plain observations: give its "
-            "zip with vecnormalize=, or a function that normalises as its training did"
+            "zip with vecnormalize=, or an object that normalises as its training did and asks the model"
         )
     observations = getattr(getattr(model, "observation_space", None), "shape", None)
     size = len(task.observation_low)

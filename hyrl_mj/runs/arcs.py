@@ -72,7 +72,7 @@ def noisy_arcs(
     """
     task = run.task  # first: the file of a user's task may register noise
     kinds = (*noise_kinds(), "worst", "attack")
-    sensor = noise_of(noise, 0.0) if " " in noise.strip() else None
+    sensor = noise_of(task, noise, 0.0) if " " in noise.strip() else None
     if sensor is None and noise not in kinds:
         raise unknown(
             "noise", noise, [*kinds, "a sum as 'uniform 0.05 + delay 1'", "'log LOG.csv'"]

@@ -25,6 +25,7 @@ from hyrl_mj.simulation.noise import (
     noise_kinds,
     register_noise,
     signal_for,
+    try_signal,
 )
 from hyrl_mj.simulation.noise_of_logs import ColumnNoise, LogNoise, noise_from_log
 from hyrl_mj.simulation.passing import Passing, windings
@@ -76,6 +77,7 @@ __all__ = [
     "signal_for",
     "simulate",
     "simulate_batch",
+    "try_signal",
     "usual_kinds",
     "way_runs",
     "windings",

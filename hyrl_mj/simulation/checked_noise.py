@@ -64,8 +64,9 @@ def drawn(signal: Signal, now: Sample) -> np.ndarray:
 
 
 def is_own(signal: Signal) -> bool:
-    """Returns whether the class of a signal is of this package."""
-    return type(signal).__module__.startswith("hyrl_mj.")
+    """Returns whether the class of a signal is of this package, and of all signals that it is made of."""
+    own = type(signal).__module__.startswith("hyrl_mj.")
+    return own and all(map(is_own, getattr(signal, "noises", ())))
 
 
 def check_repeats(signal: Signal, noise: np.ndarray, twin: Signal, now: Sample) -> None:

@@ -128,9 +128,13 @@ def column_noise(
     else:
         reference = r
         _check_units(name, y, r)
+        if not turn:
+            _check_turns(name, y - r)
     last = np.maximum.accumulate(np.where(known, np.arange(len(y)), 0))
     again = ~known | (np.abs(y - np.concatenate([y[:1], y[last[:-1]]])) <= tiny)
-    again[: np.argmin(again | (np.arange(len(y)) <= np.argmax(known)))] = False  # before it moves
+    # Before the robot moves its measurement may be the same without being held.
+    rests = np.append(True, np.abs(np.diff(reference)) <= tiny)
+    again[: np.argmin((again & rests) | (np.arange(len(y)) <= np.argmax(known)))] = False
     quantum = _quantum(y[known & ~again], int(known.sum()), tiny)
     # A quantum repeats measurements, too: held are those which are repeated where the reference moves on.
     fresh, delay, said = known if quantum else known & ~again, nan, list[str]()
@@ -207,7 +211,8 @@ def _autocorrelation(left: np.ndarray, used: np.ndarray) -> np.ndarray:
         signal.correlate(x, x, method="fft")[len(x) - 1 :][: MOST_LAGS + 1]
         for x in (white, used.astype(float))
     )
-    pairs = sums / np.maximum(counts, 1)
+    # Of a few pairs nothing can be told.
+    pairs = np.where(np.rint(counts) >= LEAST, sums / np.maximum(counts, 1), 0.0)
     return pairs / max(float(pairs[0]), 1e-300)
 
 
@@ -224,6 +229,17 @@ def _check_units(name: str, y: np.ndarray, r: np.ndarray) -> None:
                 f"{name} changes {ratio:.4g} times as much as {name}_ref, as {units}: give --scale "
                 f"{name}={1 / factor:.6g}"
             )
+
+
+def _check_turns(name: str, error: np.ndarray) -> None:
+    """Raises `BadInput` if errors (n,) jump by whole turns, as those of an angle do."""
+    error = error[np.isfinite(error)]
+    anywhere = np.pi / np.sqrt(3)  # deviation of an angle that may be any
+    if len(error) and np.std(wrapped(error)) < min(np.std(error), anywhere) / 2:
+        raise BadInput(
+            f"{name} differs from {name}_ref by up to {np.abs(error).max():.3g}, and by far less up to whole "
+            f"turns: if it is an angle in rad, give --turn {name}"
+        )
 
 
 def _slope(name: str, y: np.ndarray, r: np.ndarray) -> list[str]:
@@ -436,7 +452,10 @@ def _noise_left(
     if bound <= max(tiny, drift / 20) or whole < 1.1 * rounding:
         return 0.0, 0.0, False
     sigma = float(np.sqrt(whole - rounding))
-    if stats.kurtosis(kept) > -0.6:  # that of uniform noise is -1.2, of normal noise 0
+    uniform = not stats.kurtosis(kept) > -0.6  # that of uniform noise is -1.2, of normal noise 0
+    if sigma**2 < rounding:  # beside so much rounding only how far both reach together can be told
+        return sigma, max(bound - quantum / 2, 0.0), uniform
+    if not uniform:
         return sigma, bound * sigma / whole**0.5, False
     # Smoothing and rounding blur the edges of uniform noise, but not its deviation.
     return sigma, min(bound, sigma * 3**0.5) if drift or quantum else bound, True

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, ClassVar, Self
 import numpy as np
 
 from hyrl_mj.errors import BadInput
+from hyrl_mj.files.logs import names_of
 from hyrl_mj.simulation.noise import Noise, Sample, Signal
 from hyrl_mj.simulation.noise_of_logs import ColumnNoise, LogNoise, noise_from_log
 from hyrl_mj.simulation.sensors import Sensor
@@ -53,7 +54,9 @@ class Logged:
                 f"the log has errors of {', '.join(columns)}, and the chart of {task.name} is "
                 f"({', '.join(task.chart.names)}): rename the columns of the log"
             )
-        return _Windows(task, found, self.bound)
+        signal = _Windows(task, found, self.bound)
+        task.with_noise(tuple(signal.shares.tolist())).check_noise(signal.bound)
+        return signal
 
 
 class _Windows(Signal):
@@ -96,10 +99,11 @@ class _Windows(Signal):
 NamedNoise = Noise | Sensor | Logged
 
 
-def noise_of(text: str, bound: float, everywhere: bool = False) -> NamedNoise:
+def noise_of(task: Task, text: str, bound: float, everywhere: bool = False) -> NamedNoise:
     """Returns the noise that a text names: a kind, a sum of parts, or "log FILE" with the errors of a log.
 
     Args:
+        task: whose periodic coordinates are angles in a log.
         text: the text.
         bound, everywhere: of a kind of noise; the others tell their own bounds.
 
@@ -109,5 +113,13 @@ def noise_of(text: str, bound: float, everywhere: bool = False) -> NamedNoise:
     word, _, rest = text.strip().partition(" ")
     if word == Logged.kind and rest:
         path = Path(rest.strip())
-        return Logged(noise_from_log(path), f"{word} {path.name}")
-    return Sensor.parse(text) if rest else Noise(text, bound, everywhere)
+        angles = [
+            n for n, turns in zip(task.chart.names, task.chart.periodic, strict=True) if turns
+        ]
+        log = noise_from_log(path, turn=[name for name in names_of(path) if name in angles])
+        noise: NamedNoise = Logged(log, f"{word} {path.name}")
+    else:
+        noise = Sensor.parse(text) if rest else Noise(text, bound, everywhere)
+    if rest and everywhere:
+        raise BadInput(f"the noise {text!r} tells where it acts: leave all coordinates out")
+    return noise

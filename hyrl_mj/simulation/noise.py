@@ -7,14 +7,22 @@ those below and register it where it is defined.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from copy import copy
+from collections.abc import Sequence
+from copy import copy, deepcopy
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, Protocol, Self, TypeVar, get_args, runtime_checkable
 
 import numpy as np
 
 from hyrl_mj.errors import BadInput, check_bound, unknown
-from hyrl_mj.simulation.checked_noise import limits_of, too_large, within
+from hyrl_mj.simulation.checked_noise import (
+    check_repeats,
+    drawn,
+    is_own,
+    limits_of,
+    too_large,
+    within,
+)
 
 if TYPE_CHECKING:
     from hyrl_mj.physics.plant import Plant
@@ -27,6 +35,8 @@ NOT_STARTED = -1
 KINDS = ("none", "uniform", "alternating", "adversarial")
 # The kind that is what a task's own sensor does; see `hyrl_mj.simulation.sensors`.
 SENSOR = "sensor"
+# Words that are no kind where noise is named: parts of sensors, and what looks at a whole run.
+RESERVED = ("delay", "hold", "quantum", "log", "attack", "worst")
 # What follows the last sample of a recorded signal.
 After = Literal["refuse", "hold", "repeat", "none"]
 
@@ -70,6 +80,8 @@ class Signal(ABC):
     kind: str
     needs_controller = False
     unseeing = False
+    # Signals that it is made of.
+    noises: Sequence[Signal] = ()
     rng: np.random.Generator
 
     def __init__(self, bound: float, shares: np.ndarray):
@@ -116,6 +128,11 @@ def register_noise(signal: type[AnySignal]) -> type[AnySignal]:
     Raises:
         BadInput: another class has that kind.
     """
+    if signal.kind in RESERVED:
+        raise BadInput(
+            f"{signal.__name__} cannot be registered: {signal.kind!r} means something else where noise is "
+            "named, so choose another kind"
+        )
     other = _KINDS.get(signal.kind, signal)
     if (other.__module__, other.__qualname__) != (signal.__module__, signal.__qualname__):
         raise BadInput(
@@ -267,6 +284,8 @@ class Noise:
             BadInput: the kind needs a controller and there is none, or the bound hides the whole chart.
         """
         task.check_noise(self.bound, self.everywhere)
+        if self.everywhere and self.kind == SENSOR:
+            raise BadInput("a sensor tells where it acts: leave all coordinates out")
         shares = np.ones(len(task.noisy)) if self.everywhere else np.array(task.noisy, dtype=float)
         signal = _KINDS[self.kind](self.bound, shares.copy()).against(task, controller)
         limits = limits_of(signal)
@@ -306,5 +325,23 @@ def signal_for(noise: AnyNoise | None, task: Task, controller: Controller | None
             f'noise {noise!r:.80} cannot be used: give a hyrl_mj.Noise("uniform", 0.1), say'
         )
     signal = noise.against(task, controller)
-    object.__setattr__(signal, "_begun", limits_of(signal).copy())  # a recorded one is frozen
+    for one in (signal, *signal.noises):
+        object.__setattr__(one, "_begun", limits_of(one).copy())  # a recorded one is frozen
     return signal
+
+
+def try_signal(signal: Signal, task: Task, n: int) -> None:
+    """Raises `BadInput` if a user's signal on n simulations gives other noise with the same seed.
+
+    A closed loop looks at that by itself; in an environment an agent closes the loop.
+    """
+    if is_own(signal):
+        return
+    twins = [deepcopy(signal, {id(task): task}) for _ in range(2)]
+    for twin in twins:
+        twin.reset(n, np.random.default_rng(0))
+    plant = task.placed(task.starts(n, np.random.default_rng(0)), np.random.default_rng(0))
+    for k in range(8):
+        samples, modes = np.full(n, k), np.full(n, NOT_STARTED)
+        now = Sample(np.arange(n), samples, plant.measurement, modes, plant)
+        check_repeats(twins[0], drawn(twins[0], now), twins[1], now)

@@ -83,7 +83,10 @@ def noise_from_log(
     Raises:
         BadInput: the file or an argument cannot be used, or the log tells nothing.
     """
-    factors = {name: float(factor) for name, factor in (scale or {}).items()}
+    factors = dict(scale or {})
+    for name, factor in factors.items():
+        if isinstance(factor, bool) or not isinstance(factor, int | float | np.number):
+            raise BadInput(f"{name} cannot be multiplied by {factor!r:.40}: give a factor as 0.001")
     if bad := [name for name, factor in factors.items() if not 0 < abs(factor) < np.inf]:
         raise BadInput(
             f"{bad[0]} cannot be multiplied by {factors[bad[0]]:g}: give a factor as 0.001"
@@ -113,6 +116,8 @@ def noise_from_log(
         raise BadInput(
             f"{path} has so many gaps in time that it takes {place[-1]:,} samples: give at most {MOST:,}"
         )
+    if step > 5:
+        remarks.append(f"its rows are {step:g} s apart: are the times in seconds?")
     if rows * (1 - share) < 1 and share < 1:
         remarks.append(
             f"a bound that {share:g} of the samples keep needs {1 / (1 - share):,.0f} rows, and the log has "
@@ -130,6 +135,11 @@ def noise_from_log(
         reference = f"{name}_ref"
         r = None if at_rest else placed(data[reference] * factors.get(reference, 1.0))
         found.append(column_noise(name, placed(y), r, placed(times), step, name in turn, share))
+    if any(column.held or column.delay >= 1 for column in found):
+        remarks.append(
+            f"delay and held samples are counted in samples of this log, of {step:.3g} s: for a robot with "
+            "another sample time, give the samples of the robot that take as long, rounded up"
+        )
     if not any(len(column.errors) for column in found):
         raise BadInput(f"{path} tells no noise: {found[0].remarks[0]}")
     return LogNoise(tuple(found), tuple(remarks))

@@ -170,7 +170,7 @@ def _played(
         data.act[:] = model.key_act[0]
     loop = task.has_inner_loop
     columns = [] if loop else [model.actuator(name).id for name in task.inputs]
-    steps = max(round(task.dt / model.opt.timestep), 1)
+    steps = mjcf.substeps(model)
     _move_mocap(task, model, data)
     sensed = [_sensed(model, data)]
     for k, u in enumerate(np.clip(inputs, *task.input_limits)):

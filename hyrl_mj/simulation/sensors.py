@@ -130,6 +130,9 @@ class Part:
     value: float
     options: Mapping[str, float] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        self._check()
+
     def __str__(self) -> str:
         value, options = f"{self.value:.12g}", dict(self.options)
         if self.word == DELAY and (least := options.pop("least", self.value)) < self.value:
@@ -178,9 +181,10 @@ class Part:
             options |= {name: float(x) for name, x in zip(names, values, strict=True)}
         except ValueError as error:
             raise BadInput(f"{said} ({error}): write {what}") from None
-        return Part(word, value, options)._checked()
+        return Part(word, value, options)
 
-    def _checked(self) -> Part:
+    def _check(self) -> None:
+        """Raises `BadInput` if a number cannot be."""
         value, options = self.value, self.options
         check_bound(value)
         if self.word in (DELAY, HOLD) and not (1 <= value <= 1_000 and value == int(value)):
@@ -192,7 +196,10 @@ class Part:
         for name, x in options.items():
             if name in ("sigma", "rate") and not (math.isfinite(x) and x > 0):
                 raise BadInput(f"{self}: give a {name} > 0")
-        return self
+
+
+# A part that does nothing.
+NOTHING = Part("uniform", 0.0)
 
 
 @dataclass(frozen=True)
@@ -223,11 +230,16 @@ class Sensor:
         Raises:
             BadInput: it describes none.
         """
-        parts = tuple(Part.parse(part) for part in re.split(r"\+(?!\d)", text))  # not that of 1e+3
+        if not isinstance(text, str):
+            raise BadInput(
+                f"the sensor {text!r:.60} is no text: give one as 'uniform 0.05 + delay 1'"
+            )
+        return Sensor(tuple(map(Part.parse, re.split(r"\+(?!\d)", text))))  # not that of 1e+3
+
+    def __post_init__(self) -> None:
         for word in (DELAY, HOLD, QUANTUM):
-            if sum(part.word == word for part in parts) > 1:
-                raise BadInput(f"{text!r} has more than one {word}: give one")
-        return Sensor(parts)
+            if sum(part.word == word for part in self.parts) > 1:
+                raise BadInput(f"'{self}' has more than one {word}: give one")
 
     def __str__(self) -> str:
         return " + ".join(map(str, self.parts))
@@ -249,8 +261,8 @@ class Sensor:
         return int(self.part(DELAY).value + self.part(HOLD).value)
 
     def part(self, word: str) -> Part:
-        """Returns the part of a word, or one that does nothing."""
-        return next((part for part in self.parts if part.word == word), Part(word, 0.0))
+        """Returns the part of a word, or `NOTHING`."""
+        return next((part for part in self.parts if part.word == word), NOTHING)
 
     def reach(self, task: Task) -> np.ndarray:
         """Returns how far off each column of a measurement can be: (p,), in its unit.
@@ -260,6 +272,21 @@ class Sensor:
         added = self.bound * np.abs(self._shares(task))
         reach = added + self.late * task.moves if self.late else added
         return np.abs(np.ceil(reach * DECIMALS - ROUNDING)) / DECIMALS  # where it is 0 not -0
+
+    def _check_on(self, task: Task) -> None:
+        """Raises `BadInput` if it hides the whole chart, or the chart is not how the measurement begins."""
+        reach, d = self.reach(task), task.chart.dimension
+        if bound := float(reach[:d].max()):
+            task.with_noise(tuple((reach / bound).tolist())).check_noise(bound)
+        if self.late:
+            measured = task.placed(task.starts(16, np.random.default_rng(0))).measurement
+            apart = task.chart.difference(task.z(measured), measured[:, :d])
+            if np.abs(apart).max() > 1e-6:
+                raise BadInput(
+                    f"what a robot moves while a sensor is late is known of each column, and those of "
+                    f"{task.name} do not begin with its chart ({', '.join(task.chart.names)}): let the "
+                    "measurement begin with them, or leave delay and hold out"
+                )
 
     def on(self, task: Task) -> tuple[float, tuple[float, ...]]:
         """Returns the noise bound, and its shares (p,), that cover all that it can do to a chart point.
@@ -295,6 +322,7 @@ class Sensor:
                 f"the sensor {self} can be {self.late} samples late, and an episode of {task.name} has "
                 f"{task.max_steps}: give fewer"
             )
+        self._check_on(task)
         return Sensed(self.bound, self._shares(task)).begin(self, task, controller)
 
     def _shares(self, task: Task) -> np.ndarray:

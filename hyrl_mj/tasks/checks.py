@@ -193,18 +193,12 @@ def _check_model(task: Task) -> None:
             raise BadInput(f"{name} in {path.name} has values that are not finite: give numbers")
     for name, value in (("timestep", model.opt.timestep), ("sample_time", task.dt)):
         Number(0, LONGEST, above=True).checked(f"{name} in {path.name}", value)
-    steps = task.dt / model.opt.timestep
-    if abs(steps - round(steps)) > 1e-6 or steps < 0.5:
-        raise BadInput(
-            f"its sample time {task.dt:g} s is no multiple of the physics step "
-            f"{model.opt.timestep:g} s in {path.name}: change one of them"
-        )
-    if steps > (most := 5_000):
+    if (steps := mjcf.substeps(model)) > (most := 5_000):
         raise BadInput(
             f"its sample time {task.dt:g} s takes {steps:,.0f} physics steps of {model.opt.timestep:g} s in "
             f"{path.name}: give at most {most:,}"
         )
-    if problem := mjcf.wrong_physics(model) or memory.late_sensor(model):
+    if problem := memory.unusable(model):
         raise BadInput(problem)
 
 
