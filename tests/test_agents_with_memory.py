@@ -71,6 +71,18 @@ def test_a_closed_loop_notices_it_too(trap, starts, vehicle):
         simulate(vehicle, agent, z0, Noise("uniform", 0.1))
 
 
+def test_a_closed_loop_of_many_runs_notices_what_begins_later(vehicle):
+    def of_the_rows(observation):
+        late = observation[:, 1].mean() < 2.8 and len(observation) > 8  # on its way
+        return turning(observation.mean(axis=0) + 0 * observation if late else observation)
+
+    z0 = np.random.default_rng(0).uniform((0, 0.3), (0.2, 0.4), (300, 2))
+    simulate(vehicle, hyrl_mj.from_callable(turning, vehicle), z0, Noise("uniform", 0.1))
+    agent = hyrl_mj.from_callable(of_the_rows, vehicle)
+    with pytest.raises(BadInput, match=r"the function answers .* and, in a batch"):
+        simulate(vehicle, agent, z0, Noise("uniform", 0.1))
+
+
 class Plain:
     """A policy of the user's own, which changes what it should not."""
 

@@ -259,6 +259,7 @@ class Asked:
     task: Task
     controller: Controller
     _kept: list[tuple[np.ndarray, ...]] = field(default_factory=list)
+    _few: list[tuple[np.ndarray, ...]] = field(default_factory=list)
     _next: int = 0
 
     def __call__(
@@ -267,10 +268,12 @@ class Asked:
         """Returns inputs (n, m), next modes (n,) and memories (n, ...) at sample k of runs, as `answer`."""
         answered = answer(self.controller, q, measured, memory)
         check_inputs(answered[0], len(measured), len(self.task.inputs))
-        # Samples 0, 1, 4, 16, ...; with many runs, which takes longer, the first two.
-        if k == self._next and (k < 2 or len(measured) <= 256):
+        # Samples 0, 1, 4, 16, ...; with many runs, which takes longer, few of them after the first two.
+        if k == self._next:
             rows = (q, measured, memory, _beside(answered))
-            self._kept.append(tuple(values.copy() for values in rows))
+            if k < 2 or len(measured) <= 256:
+                self._kept.append(tuple(values.copy() for values in rows))
+            self._few.append(tuple(values[:8].copy() for values in rows))
             self._next = max(4 * k, 1)
         return answered
 
@@ -291,10 +294,9 @@ class Asked:
         for *asked, first in reversed(self._kept):
             again = _beside(answer(controller, *asked))
             compare(name, asked[1], first, again, span, words)
-        if not self._kept:
+        if not self._few:
             return
-        few = ([values[:8] for values in batch] for batch in self._kept)
-        q, measured, memory, first = map(np.concatenate, zip(*few, strict=True))
+        q, measured, memory, first = map(np.concatenate, zip(*self._few, strict=True))
 
         def ask(rows: np.ndarray, shift: np.ndarray) -> np.ndarray:
             moved = measured[rows] + shift
