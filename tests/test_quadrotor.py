@@ -1,10 +1,8 @@
 """The quadrotor flies as its rotors let it, and decides in time or crashes."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
+from experts import Expert
 
 import hyrl_mj
 from hyrl_mj import Outcome
@@ -13,10 +11,6 @@ from hyrl_mj.sets import Grid
 from hyrl_mj.simulation.rollout import LoopSettings, closed_loop
 from hyrl_mj.stages.partition import longest_hop
 from hyrl_mj.tasks.flight import rotation
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "scripts"))
-
-from robots import Expert
 
 
 @pytest.fixture(scope="module")

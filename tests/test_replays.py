@@ -322,7 +322,7 @@ def test_every_examination_by_episodes_is_judged(puck, monkeypatch):
         return judge(task, run, start, rows)
 
     monkeypatch.setattr(episodes, "judge", judged)
-    monkeypatch.setattr(episodes.cores, "spread", lambda work, calls: map(work, calls))
+    monkeypatch.setattr(episodes.cores, "in_processes", lambda work, calls: map(work, calls))
     kinds, loop = (
         [Noise(kind, 0.02) for kind in ("none", "uniform")],
         PolicyController(Straight(puck)),

@@ -1,21 +1,15 @@
 """The rover rolls on its wheels as its MJCF says, and decides in time or crashes."""
 
-import sys
-from pathlib import Path
-
 import mujoco
 import numpy as np
 import pytest
+from experts import Expert
 
 import hyrl_mj
 from hyrl_mj import Outcome
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.simulation.rollout import LoopSettings, closed_loop
 from hyrl_mj.tasks.trial import try_control
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "scripts"))
-
-from robots import Expert
 
 
 @pytest.fixture(scope="module")

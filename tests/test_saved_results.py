@@ -44,7 +44,7 @@ def test_extended_sets_come_back(tmp_path, vehicle, grid_set):
     sets = ExtendedSets((0, 1), (grid_set, ~grid_set), masks, 0.3, 0.1, *narrow)
     sets.save(tmp_path / "e.npz")
     back = ExtendedSets.load(tmp_path / "e.npz", vehicle)
-    assert (back.modes, back.horizon, back.noise) == ((0, 1), 0.3, 0.1)
+    assert (back.modes, back.horizon, back.eps) == ((0, 1), 0.3, 0.1)
     np.testing.assert_array_equal(back.between, [[0, 1]])
     for loaded, kept in zip(back.sets, sets.sets, strict=True):
         np.testing.assert_array_equal(loaded.values, kept.values)

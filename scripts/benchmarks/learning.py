@@ -7,12 +7,12 @@ from functools import partial
 from itertools import count
 
 import gymnasium
-from quality import circle_return, vehicle_share
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
 import hyrl_mj
 from benchmarks import Figure
+from benchmarks.quality import circle_return, vehicle_share
 from benchmarks.runs import Runs
 from hyrl_mj.learning import preset
 from hyrl_mj.learning.training import Score, TaskGround, export, threads, train

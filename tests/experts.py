@@ -1,0 +1,34 @@
+"""An expert rule for the robots with dynamics, which knows which side to take."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+import hyrl_mj
+
+
+@dataclass(frozen=True)
+class Expert:
+    """Passes the pillar on one side with room to spare, then goes for the set-point.
+
+    Attributes:
+        task: the rover or the quadrotor.
+        side: 1 for the left, -1 for the right.
+    """
+
+    task: hyrl_mj.Task
+    side: int
+
+    def act(self, measured: np.ndarray) -> np.ndarray:
+        """Inputs (n, m) for measurements (n, p)."""
+        x, y = measured[:, 0], measured[:, 1]
+        centre = self.task.obstacle
+        gap = self.task.clearance(np.array([[centre[0], centre[1], *measured[0, 2:]]]))[0]
+        before = x < centre[0] - 0.2 * gap
+        goal_y = np.where(before, self.side * (0.25 - gap), self.task.set_point[1])
+        if self.task.name == "quadrotor":
+            wanted = 3 * (goal_y - y)
+        else:
+            bearing = np.clip(1.5 * np.arctan2(goal_y - y, 0.5), -1.2, 1.2)
+            wanted = 4 * (bearing - measured[:, 2])
+        return np.clip(wanted[:, None], *self.task.input_limits)
