@@ -26,6 +26,7 @@ from hyrl_mj.simulation import (
     noise_of,
     register_noise,
 )
+from hyrl_mj.simulation.noise import noise_class
 from hyrl_mj.simulation.sensors import Part
 from hyrl_mj.viz import beginning
 
@@ -246,6 +247,17 @@ def test_a_late_sensor_needs_a_measurement_that_begins_with_the_chart():
     swapped.z = lambda measured: measured[:, ::-1]
     with pytest.raises(BadInput, match="let the measurement begin with them"):
         Sensor.parse("uniform 0.01 + delay 2").against(swapped, None)
+
+
+def test_noise_that_cannot_be_copied_acts_in_an_environment():
+    class Locked(noise_class("uniform")):
+        """Uniform noise that holds what no copy can have."""
+
+        def __deepcopy__(self, memo):
+            raise TypeError("cannot be copied")
+
+    noise = Locked(0.1, np.array([0.0, 1.0]))
+    assert gym.make("hyrl_mj/ObstacleAvoidance-v0", noise=noise).reset(seed=0)[0].shape == (3,)
 
 
 def test_what_hides_the_whole_chart_is_refused_wherever_it_is_used(tmp_path):

@@ -337,7 +337,10 @@ def try_signal(signal: Signal, task: Task, n: int) -> None:
     """
     if is_own(signal):
         return
-    twins = [deepcopy(signal, {id(task): task}) for _ in range(2)]
+    try:
+        twins = [deepcopy(signal, {id(task): task}) for _ in range(2)]
+    except Exception:  # what cannot be copied has no twin
+        return
     for twin in twins:
         twin.reset(n, np.random.default_rng(0))
     plant = task.placed(task.starts(n, np.random.default_rng(0)), np.random.default_rng(0))

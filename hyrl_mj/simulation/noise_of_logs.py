@@ -116,7 +116,7 @@ def noise_from_log(
         raise BadInput(
             f"{path} has so many gaps in time that it takes {place[-1]:,} samples: give at most {MOST:,}"
         )
-    if step > 5:
+    if step > 5:  # [s]: no robot is controlled so slowly
         remarks.append(f"its rows are {step:g} s apart: are the times in seconds?")
     if rows * (1 - share) < 1 and share < 1:
         remarks.append(
