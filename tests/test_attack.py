@@ -61,6 +61,17 @@ OPENED = {
         "    return {name: names.count(name) for name in names}\n"
         "files.Counter = counts",
     ),
+    "a post thinner than its rim": (
+        "^field", 61, "traceback",
+        "import inspect\n"
+        "from attacks import honest\n"
+        "from hyrl_mj.fields import driving\n"
+        "source = inspect.getsource(driving)\n"
+        "thin = 'max(geom.size[0] + larger, radii[number] / 2, 1e-6)'\n"
+        "assert thin in source\n"
+        "exec(source.replace(thin, 'geom.size[0] + larger'), vars(driving))\n"
+        "honest.Driving = driving.Driving",
+    ),
     "a name that controls the terminal": (
         "^arguments", 81, "control characters",
         "import io\n"
