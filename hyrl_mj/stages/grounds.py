@@ -12,7 +12,16 @@ from hyrl_mj.policies import MlpPolicy, Policy
 from hyrl_mj.sets import GridSet
 from hyrl_mj.simulation import AttackSettings
 from hyrl_mj.stages.extended_sets import ExtendedSets
-from hyrl_mj.stages.judges import ByAttack, ByEpisodes, ByGame, ByShare, Judge, Judged
+from hyrl_mj.stages.judges import (
+    Attacked,
+    ByAttack,
+    ByEpisodes,
+    ByGame,
+    ByShare,
+    Episodes,
+    Judge,
+    Judged,
+)
 from hyrl_mj.stages.mode_states import ModeStates
 from hyrl_mj.stages.partition import Partition
 from hyrl_mj.tasks import Task
@@ -48,11 +57,13 @@ def mode_ground(
     if states.rewarded:
         judge, parts = ByShare(states, settings), None
     elif task.effort.attacked:
-        judge = ByAttack(states, settings, policy, attacks)
+        judge = ByAttack(Attacked(Episodes(states, settings), attacks), settings, policy)
     elif game.Lattice.decides(task, states.grid):
         judge = ByGame(states, settings)
     else:
-        judge = ByEpisodes(states, settings, policy)
+        episodes = Episodes(states, settings)
+        attacked = Attacked(episodes, attacks)
+        judge = ByEpisodes(episodes, settings, policy, attacked=attacked)
     part = None if parts is None else parts.parts[parts.modes.index(mode)]
     return ModeGround(states, judge, part, settings)
 

@@ -191,19 +191,58 @@ class Episodes:
         return self.states.grid.nearest(self.starts[self.batches[batch]][~won])
 
 
+class Attacked:
+    """An attack on the policies of a mode, within the noise of its noisy episodes.
+
+    What is reported comes from the attack of the examination: other starts, another seed, more rounds.
+
+    Attributes:
+        starts: (n, d) starts of the attack. Half of them are where modes meet: there a mode may have to go
+            against its neighbours.
+    """
+
+    def __init__(self, episodes: Episodes, attacks: AttackSettings):
+        self.episodes, self.attacks, states = episodes, attacks, episodes.states
+        task, grid = states.task, states.grid
+        off = distance_to(task.chart, states.extended.points, grid.nodes[states.nodes])
+        near = states.nodes[off <= 2 * float(np.linalg.norm(states.bound / task.chart.scale))]
+        half = ATTACKED // 2 if len(near) else 0
+        self.starts = episodes.starts[: ATTACKED - half]
+        if half:
+            rng = np.random.default_rng(1)
+            meeting = grid.around(rng.choice(near, half), rng)
+            self.starts = np.vstack([self.starts, meeting])
+
+    def lost(self, policy: Policy) -> np.ndarray:
+        """Returns whether a policy loses from the starts (n,), without noise or under a signal."""
+        states = self.episodes.states
+        found = attack(
+            states.task.with_noise(states.shares),
+            {"mode": PolicyController(policy)},
+            self.starts,
+            self.episodes.noise.bound,
+            Budget(rounds=1),
+            seed=20_220_608,
+            settings=self.attacks,
+        )["mode"]
+        return found.quiet.lost | found.ends.lost
+
+
 class ByEpisodes:
-    """Judges by noisy episodes, where the worst case cannot be computed.
+    """Judges by noisy episodes and an attack, where the worst case cannot be computed.
 
     The score is the number of plays that stop no episode, then minus the share of episodes that the next play
     stops; if none is stopped, minus the largest distance from the set-point at the end without noise, as a
-    multiple of `allowed`. The mirror image of a policy that wins all of its own mode has been judged there,
-    so the first three batches tell.
+    multiple of `allowed`. The last play is the attack: a bias of its whole length is what few episodes draw.
+    The mirror image of a policy that wins all of its own mode has been judged there, so the first three
+    batches tell.
 
     Args:
-        states: where the mode has to win.
-        settings: how many episodes, and when a policy is good enough.
+        episodes: the episodes.
+        settings: when a policy is good enough.
         policy: the stage-1 policy, which shows how close to the set-point a run can end.
         kinds: kinds of noise.
+        attacked: the attack; None if another judge attacks.
 
     Attributes:
         allowed: allowed distance from the set-point at the end of episodes without noise [chart units].
@@ -214,24 +253,23 @@ class ByEpisodes:
 
     def __init__(
         self,
-        states: ModeStates,
+        episodes: Episodes,
         settings: ModeSettings,
         policy: Policy | None,
         kinds: Sequence[str] = KINDS,
+        attacked: Attacked | None = None,
     ):
-        self.episodes = Episodes(states, settings)
-        self.noise, self.margin = self.episodes.noise, self.episodes.margin
-        count = self.episodes.count
+        self.episodes, self.attacked = episodes, attacked
+        self.noise, self.margin = episodes.noise, episodes.margin
+        count = episodes.count
         # Each batch is played with all kinds of noise before the next.
         self.plays: list[Play] = [*product(range(count), kinds)]
         self.few_plays = self.plays[: 3 * len(kinds)]
-        self.enough: Score = (float(len(self.plays)), -1.0)
+        self.enough: Score = (float(len(self.plays) + (attacked is not None)), -1.0)
         # As close as the stage-1 policy ends where it arrives, if it does.
-        quiet = (
-            [self.episodes.play(policy, k, game.NO_NOISE) for k in range(count)] if policy else []
-        )
+        quiet = [episodes.play(policy, k, game.NO_NOISE) for k in range(count)] if policy else []
         ends = np.concatenate([np.empty(0), *(miss[won] for won, miss in quiet)])
-        farthest, task = float(ends.max(initial=0.0)), states.task
+        farthest, task = float(ends.max(initial=0.0)), episodes.states.task
         if np.isfinite(task.precision):
             self.allowed = max(farthest, task.precision)
         else:
@@ -244,70 +282,55 @@ class ByEpisodes:
             won, miss = self.episodes.play(policy, batch, kind)
             farthest = max(farthest, miss.max()) if kind == game.NO_NOISE else farthest
             if not won.all():
-                lost = self.episodes.nodes(batch, won)
-                return Judged(
-                    (float(survived), -len(lost) / len(won)), False, lost, np.ones(len(lost))
-                )
-        score = float(len(plays)), -farthest / self.allowed
+                return self._lost(survived, ~won, self.episodes.nodes(batch, won))
+        survived = len(plays)
+        if self.attacked is not None and twin != 1:
+            lost = self.attacked.lost(policy)
+            if lost.any():
+                nodes = self.episodes.states.grid.nearest(self.attacked.starts[lost])
+                return self._lost(survived, lost, nodes)
+            survived += 1
+        score = float(survived), -farthest / self.allowed
         return Judged(score, score[1] >= -1.0)
 
+    def _lost(self, survived: int, lost: np.ndarray, nodes: np.ndarray) -> Judged:
+        """Returns that the play after those survived loses some of its starts (k,) bool, at nodes (l,)."""
+        return Judged((float(survived), -float(lost.mean())), False, nodes, np.ones(len(nodes)))
+
     def won(self, policy: Policy, judged: Judged) -> float:
-        return 1.0 if not len(judged.lost) else self.episodes.share(policy, self.plays)
+        if not len(judged.lost):
+            return 1.0
+        if judged.score[0] == len(self.plays):  # it loses under the attack alone
+            return 1.0 + judged.score[1]
+        return self.episodes.share(policy, self.plays)
 
 
 class ByAttack:
-    """Judges by an attack, too, which finds noise that keeps a robot in a corner: where samples take long.
+    """Judges by an attack first, which finds noise that keeps a robot in a corner: where samples take long.
 
     The score is the mean of two shares: of episodes that are won without noise, and of starts from which an
     attack does not break the policy. If it loses none of them the score of the noisy episodes follows. A
     policy that wins too few of the first is not attacked, as if it were broken from everywhere. The attack
     stands for the adversary of the episodes, whose looking ahead takes too long here.
-
-    Attributes:
-        attacked: (n, d) starts of the attack. Half of them are where modes meet: there a mode may have to go
-            against its neighbours.
     """
 
     settled = 0.0
 
-    def __init__(
-        self,
-        states: ModeStates,
-        settings: ModeSettings,
-        policy: Policy | None,
-        attacks: AttackSettings,
-    ):
-        self.states, self.settings, self.attacks = states, settings, attacks
-        self.noisy = ByEpisodes(states, settings, policy, KINDS[:-1])
+    def __init__(self, attacked: Attacked, settings: ModeSettings, policy: Policy | None):
+        self.attacked, self.settings = attacked, settings
+        self.noisy = ByEpisodes(attacked.episodes, settings, policy, KINDS[:-1])
         self.noise, self.margin = self.noisy.noise, self.noisy.margin
         self.enough: Score = (1.0, *self.noisy.enough)
         self.nearly: Score = (1 - settings.may_break,)
-        task, bound, count = states.task, states.bound, ATTACKED
-        off = distance_to(task.chart, states.extended.points, states.grid.nodes[states.nodes])
-        near = states.nodes[off <= 2 * float(np.linalg.norm(bound / task.chart.scale))]
-        half, starts = count // 2 if len(near) else 0, self.noisy.episodes.starts
-        self.attacked = starts[: count - half]
-        if half:
-            rng = np.random.default_rng(1)
-            meeting = states.grid.around(rng.choice(near, half), rng)
-            self.attacked = np.vstack([self.attacked, meeting])
 
     def judge(self, policy: Policy, twin: float | None = None) -> Judged:
-        episodes = self.noisy.episodes
+        episodes = self.attacked.episodes
         quiet = [episodes.play(policy, k, game.NO_NOISE)[0] for k in range(episodes.count)]
         lost = np.concatenate([episodes.nodes(k, won) for k, won in enumerate(quiet)])
         weight, won = np.ones(len(lost)), float(np.concatenate(quiet).mean())
         if won < self.settings.worth_attacking:
             return Judged((won / 2, 0.0, -1.0), False, lost, weight)
-        task = self.states.task.with_noise(self.states.shares)
-        controllers = {"mode": PolicyController(policy)}
-        # What is reported comes from the attack of the examination: other starts, another seed, more rounds.
-        starts, budget, seed = self.attacked, Budget(rounds=1), 20_220_608
-        attacks = attack(
-            task, controllers, starts, self.noise.bound, budget, seed=seed, settings=self.attacks
-        )
-        found = attacks["mode"]
-        withstood = 1 - (found.count.unaided + found.count.lost) / len(starts)
+        withstood = 1 - float(self.attacked.lost(policy).mean())
         both = (won + withstood) / 2
         if both < 1:
             return Judged((both, 0.0, -1.0), False, lost, weight)
