@@ -13,7 +13,7 @@ from planted import (
     one_way_policy,
 )
 
-from hyrl_mj import closed_loop
+from hyrl_mj import Sensor, closed_loop
 from hyrl_mj.gym_export import BatchedEnv
 from hyrl_mj.gym_export.core import cautious_reward
 from hyrl_mj.judging.game import Game
@@ -23,9 +23,10 @@ from hyrl_mj.learning.presets import preset
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.policies.hybrid import HybridController
 from hyrl_mj.sets import Grid, GridSet
+from hyrl_mj.simulation import KINDS
 from hyrl_mj.stages.extended_sets import ExtendedSets, extend
 from hyrl_mj.stages.grounds import mode_ground
-from hyrl_mj.stages.judges import ByEpisodes, ByGame, Episodes, Judged
+from hyrl_mj.stages.judges import Attacked, ByEpisodes, ByGame, Episodes, Judged
 from hyrl_mj.stages.retraining import retrain
 
 # ---- where modes are trained
@@ -313,9 +314,19 @@ def test_episodes_tell_policies_apart(puck, puck_sets):
 
 @pytest.mark.slow
 def test_a_policy_that_just_survives_the_noise_is_not_good_enough(puck, puck_sets):
-    narrowly = round_it(puck, 1.0, clear=0.685)
+    narrowly = round_it(puck, 1.0, clear=0.705)
     assert not by_episodes(puck, puck_sets, 0).suffices(narrowly)
     assert by_episodes(puck, puck_sets, 0, margin=1.0).suffices(narrowly)
+
+
+@pytest.mark.slow
+def test_a_policy_that_survives_all_episodes_is_attacked(puck, puck_sets):
+    ground = by_episodes(puck, puck_sets, 0, margin=1.0)
+    closer = round_it(puck, 1.0, clear=0.685)
+    assert ground(closer) == (len(ground.judge.plays), -1 / 64), "one start of 64 is lost"
+    assert not ground.suffices(closer)
+    assert len(lost_by(ground)) == 1
+    assert ground.won(closer) == 1 - 1 / 64
 
 
 def test_the_judge_s_noise_never_hides_the_chart(puck, puck_sets):
@@ -377,6 +388,24 @@ def test_they_start_where_the_mode_may_be_picked(puck, puck_sets):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("text", "noise"),
+    [("uniform 0.02 + delay 1", "sensor"), ("uniform 0.02 + bias 0.02", "uniform")],
+)
+def test_modes_are_trained_and_judged_under_what_the_sensor_does(puck, puck_sets, text, noise):
+    bound, shares = Sensor.parse(text).on(puck)
+    task = puck.with_sensor(text, shares)
+    sets = replace(puck_sets, eps=bound)
+    ground = by_episodes(task, sets, 0)
+    assert ground.noise.kind == noise
+    assert {kind for _, kind in ground.judge.plays} == {*KINDS, "sensor"}
+    settings = replace(preset(task, "smoke").stage6, samples=4_096, attempts=1)
+    policy, result = retrain(ground, settings, seed=0)
+    assert result.attempts == 1
+    assert ground(policy) < ground.enough, "so little training does not suffice"
+
+
+@pytest.mark.slow
 def test_a_mirror_image_is_taken_there_too(puck, puck_sets, monkeypatch):
     settings = replace(preset(puck, "smoke").stage6, samples=4_096)
     other = training.export(training.build(puck, settings, seed=0), puck)
@@ -387,9 +416,9 @@ def test_a_mirror_image_is_taken_there_too(puck, puck_sets, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("won", "plays"), [(0.5, 20), (1.0, 12)])
+@pytest.mark.parametrize(("won", "plays", "attacks"), [(0.5, 20, 1), (1.0, 12, 0)])
 def test_the_image_of_a_policy_that_wins_all_is_judged_by_fewer_episodes(
-    puck, puck_sets, monkeypatch, won, plays
+    puck, puck_sets, monkeypatch, won, plays, attacks
 ):
     ground, played = by_episodes(puck, puck_sets, 1), []
 
@@ -397,9 +426,14 @@ def test_the_image_of_a_policy_that_wins_all_is_judged_by_fewer_episodes(
         played.append((batch, kind))
         return np.ones(FEW[batch], dtype=bool), np.zeros(FEW[batch])
 
+    def lost(attacked, policy):
+        played.append("attack")
+        return np.zeros(len(attacked.starts), dtype=bool)
+
     monkeypatch.setattr(Episodes, "play", play)
+    monkeypatch.setattr(Attacked, "lost", lost)
     assert ground.won_by_image(object(), won) == 1.0
-    assert played == ground.judge.plays[:plays]
+    assert played == [*ground.judge.plays[:plays], *["attack"] * attacks]
 
 
 @pytest.mark.slow

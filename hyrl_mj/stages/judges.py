@@ -15,7 +15,16 @@ from hyrl_mj.learning import ModeSettings
 from hyrl_mj.learning.training import Score
 from hyrl_mj.policies import Policy, PolicyController
 from hyrl_mj.sets import distance_to
-from hyrl_mj.simulation import KINDS, AttackSettings, LoopSettings, Noise, closed_loop
+from hyrl_mj.simulation import (
+    KINDS,
+    SENSOR,
+    AttackSettings,
+    LoopSettings,
+    Noise,
+    Sensor,
+    closed_loop,
+    covers_sensor,
+)
 from hyrl_mj.stages.mode_states import ModeStates
 from hyrl_mj.tasks import Outcome
 
@@ -145,7 +154,8 @@ class Episodes:
         starts: (n, d) starts of the episodes.
         batches: the rows of each batch.
         margin: the noise is so many times as large as the bound.
-        noise: the noise during training.
+        kinds: the kinds of noise that the episodes may have.
+        noise: the noise during training: what the task's own sensor does, if that is late.
         count: number of batches that the task's effort allows.
     """
 
@@ -156,7 +166,11 @@ class Episodes:
         with np.errstate(divide="ignore"):
             most = (task.chart.sides / (2 * states.bound)).min()
         self.margin = min(settings.margin, (1 + most) / 2)  # noise must not hide the whole chart
-        self.noise = Noise("uniform", self.margin * states.extended.eps)
+        bound = self.margin * states.extended.eps
+        self.kinds = (*KINDS, SENSOR) if covers_sensor(task, bound) else KINDS
+        # A late sensor is late in every column, also in those that the bound says nothing about.
+        late = SENSOR in self.kinds and Sensor.parse(task.sensor).late
+        self.noise = Noise(SENSOR if late else "uniform", bound)
         picked = states.early[states.selected[states.early]]
         rng, episodes = np.random.default_rng(0), sum(sizes)
         # More than are needed: those too close to where the mode cannot succeed are left out.
@@ -241,8 +255,8 @@ class ByEpisodes:
         episodes: the episodes.
         settings: when a policy is good enough.
         policy: the stage-1 policy, which shows how close to the set-point a run can end.
-        kinds: kinds of noise.
         attacked: the attack; None if another judge attacks.
+        without: a kind of noise that no episode has.
 
     Attributes:
         allowed: allowed distance from the set-point at the end of episodes without noise [chart units].
@@ -256,10 +270,11 @@ class ByEpisodes:
         episodes: Episodes,
         settings: ModeSettings,
         policy: Policy | None,
-        kinds: Sequence[str] = KINDS,
         attacked: Attacked | None = None,
+        without: str = "",
     ):
         self.episodes, self.attacked = episodes, attacked
+        kinds = [kind for kind in episodes.kinds if kind != without]
         self.noise, self.margin = episodes.noise, episodes.margin
         count = episodes.count
         # Each batch is played with all kinds of noise before the next.
@@ -318,7 +333,7 @@ class ByAttack:
 
     def __init__(self, attacked: Attacked, settings: ModeSettings, policy: Policy | None):
         self.attacked, self.settings = attacked, settings
-        self.noisy = ByEpisodes(attacked.episodes, settings, policy, KINDS[:-1])
+        self.noisy = ByEpisodes(attacked.episodes, settings, policy, without=KINDS[-1])
         self.noise, self.margin = self.noisy.noise, self.noisy.margin
         self.enough: Score = (1.0, *self.noisy.enough)
         self.nearly: Score = (1 - settings.may_break,)
