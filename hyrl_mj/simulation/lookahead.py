@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import product
 from typing import Self
 
@@ -13,6 +13,7 @@ from hyrl_mj.errors import BadInput
 from hyrl_mj.physics.plant import Plant
 from hyrl_mj.policies import Controller, answer, is_memory, memory_at_start
 from hyrl_mj.simulation.noise import NOT_STARTED, Sample, Signal, register_noise
+from hyrl_mj.simulation.passing import Rows
 from hyrl_mj.tasks import Outcome, Task
 
 # Samples by which a plant with inertia is simulated ahead.
@@ -22,7 +23,7 @@ BATCH = 2_048
 
 
 @dataclass
-class Ahead:
+class Ahead(Rows):
     """What k simulations ahead show, and how they could go on.
 
     Attributes:
@@ -36,14 +37,6 @@ class Ahead:
     state: np.ndarray
     answers: np.ndarray
     goes_on: np.ndarray
-
-    def __getitem__(self, rows: np.ndarray | slice) -> Ahead:
-        return Ahead(*(getattr(self, field.name)[rows] for field in fields(self)))
-
-    def put(self, rows: np.ndarray, other: Ahead) -> None:
-        """Takes over other simulations (r,) as those of indices `rows` (r,)."""
-        for field in fields(self):
-            getattr(self, field.name)[rows] = getattr(other, field.name)
 
 
 def memory_of(controller: Controller, now: Sample) -> np.ndarray:

@@ -35,8 +35,10 @@ NOT_STARTED = -1
 KINDS = ("none", "uniform", "alternating", "adversarial")
 # The kind that is what a task's own sensor does; see `hyrl_mj.simulation.sensors`.
 SENSOR = "sensor"
-# Words that are no kind where noise is named: parts of sensors, and what looks at a whole run.
-RESERVED = ("delay", "hold", "quantum", "log", "attack", "worst")
+# The words of parts of sensors that are not noise which is added to a sample; and of the errors of a log.
+DELAY, HOLD, QUANTUM, LOG = "delay", "hold", "quantum", "log"
+# Words that are no kind where noise is named: these, and what looks at a whole run.
+RESERVED = (DELAY, HOLD, QUANTUM, LOG, "attack", "worst")
 # What follows the last sample of a recorded signal.
 After = Literal["refuse", "hold", "repeat", "none"]
 

@@ -19,7 +19,7 @@ from hyrl_mj.simulation.noise import (
     Signal,
     signal_for,
 )
-from hyrl_mj.simulation.passing import Follower, Passing
+from hyrl_mj.simulation.passing import Passing
 from hyrl_mj.system.progress import progress_bar
 from hyrl_mj.tasks import Outcome
 
@@ -153,7 +153,7 @@ def closed_loop(
     if record and settings.states:
         kept["state"] = _Table(n, plant.state.shape[1:])
         kept["state"].put(k, every, plant.state)
-    follower = Follower(task, plant) if settings.passing else None
+    passing = Passing.begin(task, plant) if settings.passing else None
     ticks = range(longest) if together else count()
     for tick in progress_bar(ticks, settings.label, "samples", quiet=settings.quiet):
         active = np.flatnonzero((outcome == Outcome.RUNNING) & (k < limit))[:most]
@@ -184,8 +184,8 @@ def closed_loop(
         path[now.k + 1, rows] = task.chart.near(task.z(measurement[rows]), path[now.k, rows])
         k[rows] += 1
         length[active] = k[active]
-        if follower is not None:
-            follower.follow(active[~lost[active]])
+        if passing is not None:
+            passing.follow(task, plant, active[~lost[active]])
         if not backward:
             outcome[active] = task.outcome(measurement[active], lost[active])
             over = active[(outcome[active] == Outcome.RUNNING) & (k[active] == limit[active])]
@@ -217,7 +217,6 @@ def closed_loop(
         arrays[name] = table.values[: samples + (name not in shapes or name == "noise")]
     for name in ("before", "q"):  # of runs that were over before they began, none
         arrays[name] = np.nan_to_num(arrays[name], nan=NOT_STARTED).astype(int)
-    passing = None if follower is None else follower.passing
     return Rollout(
         path[: samples + 1], length, limit, outcome, first_mode, **arrays, passing=passing
     )

@@ -18,7 +18,11 @@ import numpy as np
 from hyrl_mj.errors import BadInput, check_bound, unknown
 from hyrl_mj.simulation.checked_noise import drawn, limits_of
 from hyrl_mj.simulation.noise import (
+    DELAY,
+    HOLD,
     KINDS,
+    LOG,
+    QUANTUM,
     SENSOR,
     Sample,
     Signal,
@@ -32,8 +36,6 @@ if TYPE_CHECKING:
     from hyrl_mj.policies import Controller
     from hyrl_mj.tasks import Task
 
-# The words of parts that are not noise which is added to a sample.
-DELAY, HOLD, QUANTUM = "delay", "hold", "quantum"
 # Bounds are rounded up to parts of so many, but for the rounding of sums of floats, which is far below that.
 DECIMALS, ROUNDING = 1e9, 1e-3
 
@@ -152,7 +154,7 @@ class Part:
             BadInput: it names none, or a number that cannot be.
         """
         word, *rest = text.split() or [""]
-        if word == "log":
+        if word == LOG:
             raise BadInput(
                 f"{text.strip()!r} is no part of a sensor: hyrl-mj noise LOG.csv tells which parts it has"
             )
