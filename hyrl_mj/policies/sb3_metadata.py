@@ -8,7 +8,6 @@ sample earlier in its place. Under it PPO and A2C keep the very first.
 from __future__ import annotations
 
 import base64
-import binascii
 import re
 from collections.abc import Mapping
 from functools import cached_property
@@ -78,12 +77,13 @@ def check_observations(
     if about.get("num_timesteps") == 0:
         return  # it has not been trained
     last, original = (
-        _observations(about, f"_last_{name}", task) for name in ("obs", "original_obs")
+        _observations(_decoded(about.get(f"_last_{name}")), task)
+        for name in ("obs", "original_obs")
     )
     possible, normalized = _Possible(task), None
     if on_policy and "_last_original_obs" in about and about["_last_original_obs"] is None:
         normalized = False  # under VecNormalize SB3 keeps it from the first observation on
-    elif last is not None and original is not None and _sizes(last) == _sizes(original):
+    elif last is not None and original is not None:
         normalized = _normalized(last, original, possible, on_policy, n_stack)
         if normalized:
             raise BadArtifact(
@@ -95,6 +95,30 @@ def check_observations(
         raise BadArtifact(
             "nothing in it tells whether it was trained on normalised observations (VecNormalize), as "
             f"would change its inputs: {HOW}"
+        )
+
+
+def check_model(model: Any, task: Task) -> None:
+    """Raises `BadInput` unless a model of SB3, if it is one, was trained on plain observations."""
+    normalizer = getattr(model, "get_vec_normalize_env", lambda: None)()
+    original = getattr(model, "_last_original_obs", None)
+    normalized: bool | None = normalizer is not None and normalizer.norm_obs
+    if getattr(model, "get_env", lambda: None)() is None and original is not None:
+        # A loaded model has no environment; it has kept what its last one observed.
+        last, before = (_observations(found, task) for found in (model._last_obs, original))
+        normalized, on_policy = None, hasattr(model, "rollout_buffer")
+        if last is not None and before is not None:
+            normalized = _normalized(last, before, _Possible(task), on_policy, 1)
+    if normalized:
+        raise BadInput(
+            "the model was trained under VecNormalize, and would be asked about plain observations: give its "
+            "zip with vecnormalize=, or an object that normalises as its training did and asks the model"
+        )
+    if normalized is None:
+        raise BadInput(
+            "nothing in the model tells whether it was trained on observations that VecNormalize normalised, "
+            "or whether that normalised rewards alone, if anything: load it with the environment of its "
+            'training, as load(path, env=env), or give its zip with vecnormalize="none" if it saw plain ones'
         )
 
 
@@ -137,6 +161,9 @@ def _normalized(
 
     None if that cannot be told.
     """
+    shapes = [{name: part.shape for name, part in parts.items()} for parts in (last, original)]
+    if shapes[0] != shapes[1]:
+        return None
     open_columns: list[bool] = []
     for name, after in last.items():
         before = original[name]
@@ -151,33 +178,33 @@ def _normalized(
     return possible.normalized(_joined(last), _joined(original), on_policy, np.array(open_columns))
 
 
-def _observations(about: Mapping[str, Any], key: str, task: Task) -> _Parts | None:
-    """Returns the observations in an entry of the metadata; None if there are none of this task.
+def _decoded(found: Any) -> Any:
+    """Returns the array, or the arrays of a Dict, in an entry of the metadata; None if there are none."""
+    text = found.get(":serialized:") if isinstance(found, dict) else None
+    try:
+        arrays = pickled.arrays(base64.b64decode(text, validate=True))
+    except (TypeError, ValueError):
+        return None
+    return arrays.get("", arrays)
+
+
+def _observations(found: Any, task: Task) -> _Parts | None:
+    """Returns the observations of this task in an array, or in those of a Dict; None if there are none.
 
     Of stacked observations these are the latest.
     """
-    found = about.get(key)
-    text = found.get(":serialized:") if isinstance(found, dict) else None
-    if not isinstance(text, str):
-        return None
-    try:
-        found = pickled.arrays(base64.b64decode(text, validate=True))
-    except (binascii.Error, ValueError):
-        return None
-    sizes = {"": len(task.observation_low)} if "" in found else task.observation_parts
+    sizes = task.observation_parts
+    if isinstance(found, np.ndarray):
+        found, sizes = {"": found}, {"": len(task.observation_low)}
     latest = {}
     for name, size in sizes.items():
-        part = found.get(name)
+        part = found.get(name) if isinstance(found, dict) else None
         if part is None or part.ndim != 2 or not part.size or part.shape[1] % size:
             return None
         latest[name] = part[:, -size:]
     if len({len(part) for part in latest.values()}) != 1:
         return None
     return latest if all(np.isfinite(part).all() for part in latest.values()) else None
-
-
-def _sizes(parts: _Parts) -> dict[str, tuple[int, ...]]:
-    return {name: part.shape for name, part in parts.items()}
 
 
 def _joined(parts: _Parts) -> np.ndarray:
