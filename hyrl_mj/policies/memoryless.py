@@ -91,41 +91,41 @@ def answers(
     return u, memory
 
 
-class _Trial:
-    """The trial of one policy.
+# Measurements (n, p) that were asked about together, memories (n, ...) with them, and the first answers
+# (n, m + k) to them: inputs, and the numbers of the next memories.
+Batch = tuple[np.ndarray, np.ndarray, np.ndarray]
 
-    Attributes:
-        asked: the measurements (n, p) that were asked about together, the memories (n, ...) with them, and
-            the first answers (n, m + k) to them: inputs, and the numbers of the next memories.
-    """
+
+class _Trial:
+    """The trial of one policy."""
 
     def __init__(self, policy: Policy, task: Task, name: str):
         self.policy, self.task, self.name = policy, task, name
-        self.asked: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+        self.asked: list[Batch] = []
         self._before = (np.zeros(0), np.zeros(0))  # the latest answer, and a copy of it
         self._span = _span(task)
 
     def run(self) -> None:
         self._act()
         for batch in reversed(self.asked):
-            self._compare(*batch, "asked again later", again=True)
+            self._compare(batch, "asked again later", again=True)
         measured, memory, first = map(np.concatenate, zip(*self.asked, strict=True))
         rng, whole = np.random.default_rng(1), np.arange(len(measured))
-        ends = np.cumsum([len(batch) for batch, _, _ in self.asked])
+        ends = np.cumsum([len(rows) for rows, _, _ in self.asked])
         orders = [whole, rng.permutation(whole)]
         orders += np.array_split(rng.permutation(whole), max(len(whole) // 3, 1))[: SAMPLES // SOME]
-        for (batch, _, _), end in zip(self.asked[::SOME], ends[::SOME], strict=True):
-            others = rng.choice(whole, len(batch) - 1)
-            orders.append(np.append(end - len(batch), others))
+        for (rows, _, _), end in zip(self.asked[::SOME], ends[::SOME], strict=True):
+            others = rng.choice(whole, len(rows) - 1)
+            orders.append(np.append(end - len(rows), others))
         for order in orders:
-            asked = measured[order], memory[order], first[order]
-            self._compare(*asked, f"in a batch of {len(order)}")
+            batch = measured[order], memory[order], first[order]
+            self._compare(batch, f"in a batch of {len(order)}")
         one = np.empty((1, measured.shape[1]))
         for i in rng.permutation(len(whole))[:128, None]:
             one[:] = measured[i]
-            self._compare(one, memory[i], first[i], "alone")
+            self._compare((one, memory[i], first[i]), "alone")
         for batch in self.asked[::SOME]:
-            self._compare(*batch, f"asked again after {len(whole)} others", again=True)
+            self._compare(batch, f"asked again after {len(whole)} others", again=True)
 
     def _act(self) -> None:
         """Acts in runs from the start distribution; what has ended begins anew once all have."""
@@ -164,15 +164,9 @@ class _Trial:
         self._before = u, u.copy()
         return np.column_stack([u.astype(float), after.reshape(len(u), -1)])
 
-    def _compare(
-        self,
-        measured: np.ndarray,
-        memory: np.ndarray,
-        first: np.ndarray,
-        words: str,
-        again: bool = False,
-    ) -> None:
-        compare(self.name, self._ask, (measured, memory), first, self._span, words, again)
+    def _compare(self, batch: Batch, words: str, again: bool = False) -> None:
+        *asked, first = batch
+        compare(self.name, self._ask, asked, first, self._span, words, again)
 
 
 def _span(task: Task) -> np.ndarray:

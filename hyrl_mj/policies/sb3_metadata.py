@@ -67,9 +67,7 @@ def _box(low: np.ndarray, high: np.ndarray) -> str:
     return " x ".join(text + ["..."] * (max(len(low), len(high)) > 6))
 
 
-def check_observations(
-    about: Mapping[str, Any], task: Task, on_policy: bool, n_stack: int = 1
-) -> None:
+def check_observations(about: Mapping[str, Any], task: Task, on_policy: bool, n_stack: int) -> None:
     """Raises `BadArtifact` unless the metadata show that an agent was trained on plain observations.
 
     `on_policy` tells PPO and A2C from the others; `n_stack` is the number of observations that it sees.
@@ -138,7 +136,7 @@ def _check_wrappers(about: Mapping[str, Any], last: _Parts | None, possible: _Po
     which, types = "", {str(part.dtype) for part in (last or {}).values()}
     space = about.get("observation_space")
     limits = [_numbers(space, end) if isinstance(space, dict) else None for end in ("low", "high")]
-    ours = np.array([task.observation_low, task.observation_high], dtype=float)
+    ours = possible.limits
     if joined is not None and given is False:
         which = f"its last one is {_row(joined)}, which {task.name} never gives"
     elif task.observation_dtype == "float64" and "float32" in types:
@@ -180,7 +178,7 @@ def _normalized(
 
 def _decoded(found: Any) -> Any:
     """Returns the array, or the arrays of a Dict, in an entry of the metadata; None if there are none."""
-    text = found.get(":serialized:") if isinstance(found, dict) else None
+    text: Any = found.get(":serialized:") if isinstance(found, dict) else None
     try:
         arrays = pickled.arrays(base64.b64decode(text, validate=True))
     except (TypeError, ValueError):
@@ -220,29 +218,24 @@ class _Possible:
 
     def __init__(self, task: Task):
         self.task, self._rng = task, np.random.default_rng(0)
-
-    @cached_property
-    def _plant(self) -> Any:
-        """Copies of the robot, until `by_step` at its start."""
-        return self.task.placed(self.task.starts(256, self._rng), self._rng)
-
-    @cached_property
-    def _measured(self) -> np.ndarray:
-        return np.asarray(self._plant.measurement)
+        self.limits = np.array([task.observation_low, task.observation_high], dtype=float)
 
     @cached_property
     def starts(self) -> np.ndarray:
         """Observations (n, k) where episodes start."""
+        # Copies of the robot, until `by_step` there.
+        self._plant = self.task.placed(self.task.starts(256, self._rng), self._rng)
+        self._measured = np.asarray(self._plant.measurement)
         return self.task.observation(self._measured)
 
     @cached_property
     def by_noise(self) -> np.ndarray:
         """The largest difference (k,) between two observations that noise makes."""
-        shares = np.array(self.task.noisy, dtype=float)
+        starts, shares = self.starts, np.array(self.task.noisy, dtype=float)
         # A training may have had noise on the measurements of 0.1, in the units of the chart.
         noise = self._rng.uniform(-0.1, 0.1, self._measured.shape) * shares
         noisy = self.task.observation(self._measured + noise)
-        return np.asarray(2 * np.abs(noisy - self.starts).max(axis=0))
+        return np.asarray(2 * np.abs(noisy - starts).max(axis=0))
 
     @cached_property
     def by_step(self) -> np.ndarray:
@@ -258,34 +251,23 @@ class _Possible:
             before = after
         return longest
 
-    @cached_property
-    def _inverts(self) -> bool:
-        """Whether the task tells what was measured from what was observed."""
-        try:
-            self.task.measured(np.zeros((1, len(self.task.observation_low))))
-        except BadInput:
-            return False
-        return True
-
-    @property
-    def _limits(self) -> np.ndarray:
-        return np.array([self.task.observation_low, self.task.observation_high], dtype=float)
-
     @property
     def slack(self) -> np.ndarray:
         """How far observations (k,) may lie beyond those that were found."""
-        low, high = self._limits
+        low, high = self.limits
         return np.asarray(self.by_noise + self.by_step + 1e-3 * (high - low))
 
     def include(self, last: np.ndarray) -> bool | None:
         """Returns whether a task gives such observations (n, k); None if that cannot be told."""
-        low, high = self._limits
+        low, high = self.limits
         outside = (
             (last < low) | (last > high)
         ).any()  # else the slack, which takes long, is not needed
         if outside and ((last < low - self.slack) | (last > high + self.slack)).any():
             return False
-        if not self._inverts:
+        try:
+            self.task.measured(np.zeros((1, len(low))))
+        except BadInput:  # it does not tell what was measured
             return None
         tolerance = ROUNDING + 5 * self._off(self.starts.astype(np.float32)).max()
         if np.median(self._off(0.7 * self.starts + 0.1)) <= tolerance:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from copy import copy
 from dataclasses import dataclass, replace
 from math import nan
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -91,7 +90,7 @@ class LogNoise:
 class _Windows(Signal):
     """Windows of the errors of some columns of the measurement, each given with its number."""
 
-    kind = "log"
+    kind = LOG
     unseeing = True
 
     def __init__(self, task: Task, columns: list[tuple[int, ColumnNoise]], bound: float):
@@ -104,9 +103,6 @@ class _Windows(Signal):
         self._time = min(column.times[-1] for _, column in columns) - self._first
         if self._time <= 0:
             raise BadInput("the columns of the log have no time in common: give them the same rows")
-
-    def against(self, task: Task, controller: Controller | None) -> Self:
-        return copy(self)
 
     def reset(self, n: int, rng: np.random.Generator) -> None:
         super().reset(n, rng)

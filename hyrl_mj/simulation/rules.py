@@ -53,7 +53,7 @@ class AttackSettings:
 
 
 class RuleKind(StrEnum):
-    """The kinds of rules; the first five say what the answers of a controller to noise are chosen for."""
+    """The kinds of rules; the first six, `WISHES`, say what a controller's answer to noise is chosen for."""
 
     CONTRARY = "contrary"
     STRAIGHT = "straight"
@@ -70,6 +70,7 @@ class RuleKind(StrEnum):
     AHEAD = "ahead"
 
 
+WISHES = tuple(RuleKind)[:6]
 # With more noisy columns than this, rules of noise act on each of them alone and on all together, since
 # their combinations are too many.
 COMBINED = 3
@@ -82,19 +83,16 @@ class Rule:
     Attributes:
         kind: its kind; the same for both signs and for all columns, periods and times.
         noise: (p,) the noise; zero of a rule that chooses it.
-        wish: what an answer is chosen for: a word, or the column and direction of the input to steer to;
-            None of a rule that does not ask the controller.
         period: number of samples after which the sign has changed twice; 0 where it never changes.
         flip: the sample from which the sign is the other one; 0 where it stays.
-        turns: whether the sign is the other one while the mode is not the first of the run.
+        steer: the column and the direction of the input to steer to.
     """
 
     kind: RuleKind
     noise: np.ndarray
-    wish: RuleKind | tuple[int, int] | None = None
     period: int = 0
     flip: int = 0
-    turns: bool = False
+    steer: tuple[int, int] = (0, 0)
 
 
 class Rules:
@@ -143,24 +141,19 @@ class Rules:
     ):
         self.bound, self.shares = bound, shares
         self.candidates = bound * _directions(shares != 0) * shares
-        none, inputs = np.zeros(len(shares)), len(task.inputs)
-        ends = list(self._ends())
-        first, *others = ends if ends else [none]
-        wishes = [
-            Rule(wish, none, wish)
-            for wish in (RuleKind.CONTRARY, RuleKind.STRAIGHT, RuleKind.REVERSE)
-        ]
-        wishes += [Rule(RuleKind.STEER, none, wish) for wish in product(range(inputs), (1, -1))]
+        none, ends = np.zeros(len(shares)), list(self._ends())
+        wishes = [Rule(kind, none) for kind in WISHES[:3]]
+        directions = product(range(len(task.inputs)), (1, -1))
+        wishes += [Rule(RuleKind.STEER, none, steer=direction) for direction in directions]
         own = []
         if len(controller.modes) > 1:
-            own = [Rule(wish, none, wish) for wish in (RuleKind.JUMP, RuleKind.STAY)]
-            own += [
-                Rule(RuleKind.TURN, sign * noise, turns=True) for noise in ends for sign in (1, -1)
-            ]
-        common = [*wishes, *_simple(first)]
-        for noise in others:
-            common += _simple(noise)
-        common += _timed(first, length or task.max_steps, settings)
+            own = [Rule(kind, none) for kind in (RuleKind.JUMP, RuleKind.STAY)]
+            own += [Rule(RuleKind.TURN, sign * noise) for noise in ends for sign in (1, -1)]
+        common = [*wishes]
+        for noise in ends or [none]:
+            common += [Rule(RuleKind.CONSTANT, sign * noise) for sign in (1, -1)]
+            common.append(Rule(RuleKind.ALTERNATING, noise, period=2))
+        common += _timed((ends or [none])[0], length or task.max_steps, settings)
         self.all = [*common, *own, Rule(RuleKind.NOTHING, none), Rule(RuleKind.AHEAD, none)]
         self.own = np.arange(len(common), len(common) + len(own))
         # An environment cannot be simulated ahead from the middle of an episode.
@@ -172,17 +165,14 @@ class Rules:
         self.common = np.arange(len(common))
         if self.lookahead is not None:  # it is the strongest, and takes longer than the others
             self.common = np.insert(self.common, len(wishes) + 3, self.ahead)
-        held = [
-            number
-            for number, r in enumerate(self.all)
-            if not r.flip and r.kind != RuleKind.PERIODIC
-        ]
+        timed = (RuleKind.FLIP, RuleKind.PERIODIC)
+        held = [number for number, rule in enumerate(self.all) if rule.kind not in timed]
         self.parts = np.array(held[:-1])  # without `ahead`
         self.noise = np.array([rule.noise for rule in self.all])
         self.period = np.array([rule.period for rule in self.all])
         self.flip = np.array([rule.flip for rule in self.all])
-        self.turns = np.array([rule.turns for rule in self.all])
-        self.wishful = np.array([rule.wish is not None for rule in self.all])
+        self.turns = np.array([rule.kind == RuleKind.TURN for rule in self.all])
+        self.wishful = np.array([rule.kind in WISHES for rule in self.all])
 
     def __len__(self) -> int:
         return len(self.all)
@@ -227,12 +217,6 @@ def _timed(noise: np.ndarray, length: int, settings: AttackSettings) -> Iterator
     periods = 3 * ratio ** np.arange(math.ceil(math.log(max(length, 3), ratio)))
     for period in np.unique(np.rint(periods[periods <= length]).astype(int)):
         yield Rule(RuleKind.PERIODIC, noise, period=int(period))
-
-
-def _simple(noise: np.ndarray) -> list[Rule]:
-    """Returns the rules of a noise (p,) of both signs and of alternating ones."""
-    constant = [Rule(RuleKind.CONSTANT, sign * noise) for sign in (1, -1)]
-    return [*constant, Rule(RuleKind.ALTERNATING, noise, period=2)]
 
 
 def _directions(noisy: np.ndarray) -> np.ndarray:
