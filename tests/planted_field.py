@@ -4,8 +4,7 @@ import mujoco
 import numpy as np
 
 from hyrl_mj.sets import Chart
-from hyrl_mj.simulation import WayRuns
-from hyrl_mj.simulation.passing import Follower
+from hyrl_mj.simulation import Passing, WayRuns
 from hyrl_mj.tasks import Outcome, Scene, Task
 
 FIELD = """
@@ -122,11 +121,11 @@ def followed(task, path):
     n = path.shape[1]
     plant = task.plant(n)
     plant.set_state(*task.state(path[0]))
-    follower = Follower(task, plant)
+    passing = Passing.begin(task, plant)
     for z in path[1:]:
         plant.set_state(*task.state(z))
-        follower.follow(np.arange(n))
-    return follower.passing
+        passing.follow(task, plant, np.arange(n))
+    return passing
 
 
 def runs_along(task, path, arrived=None):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from planted import sign_policy
-from stable_baselines3 import PPO
+from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.vec_env import VecNormalize
 from trapped import HONEST, TRAPS
 
@@ -486,6 +486,29 @@ def test_a_model_of_other_observations_or_actions_is_refused(circle, tmp_path):
     model.action_space = gym.spaces.Box(-2, 2, (1,))
     with pytest.raises(BadInput, match="give a function that scales them"):
         from_callable(model, circle)
+
+
+@pytest.mark.parametrize("algorithm", [PPO, SAC])
+def test_a_model_that_was_trained_on_plain_observations_is_taken(algorithm, circle, tmp_path):
+    env = VecNormalize(TaskVecEnv(BatchedEnv(circle, 1)), norm_obs=False)  # of rewards alone
+    options = {"n_steps": 8, "batch_size": 8} if algorithm is PPO else {"learning_starts": 100}
+    for envs in (env, env.venv):
+        model = algorithm("MlpPolicy", envs, seed=0, device="cpu", **options).learn(8)
+        model.save(tmp_path / "model.zip")
+        for found in (model, algorithm.load(tmp_path / "model.zip", device="cpu")):
+            assert from_callable(found, circle).act(np.ones((2, 1))).shape == (2, 1)
+
+
+def test_a_model_that_does_not_tell_what_was_normalised_is_refused(tmp_path):
+    rover = hyrl_mj.get_task("rover")
+    env = VecNormalize(TaskVecEnv(BatchedEnv(rover, 1)), norm_obs=False)
+    model = PPO("MlpPolicy", env, n_steps=8, batch_size=8, device="cpu").learn(8)
+    model.save(tmp_path / "model.zip")
+    with pytest.raises(BadInput, match=r"nothing in the model tells .* or .* rewards alone"):
+        from_callable(PPO.load(tmp_path / "model.zip", device="cpu"), rover)
+    again = PPO.load(tmp_path / "model.zip", env=env, device="cpu")
+    plant = rover.placed(rover.starts(2, np.random.default_rng(0)))
+    assert from_callable(again, rover).act(plant.measurement).shape == (2, len(rover.inputs))
 
 
 # ---- from the command line

@@ -373,8 +373,9 @@ def test_levels_and_times_that_evolve_stay_within_the_bound():
 def test_wishes_pick_the_answers_that_they_name(vehicle):
     loop = PolicyController(sign_policy(vehicle))
     rules = Rules(vehicle, loop, EPS, np.array([0.0, 1.0]))
-    wishes = [rule.wish for rule in rules.all[:5]]
-    assert wishes == ["contrary", "straight", "reverse", (0, 1), (0, -1)]
+    wishes = [(rule.kind, rule.steer) for rule in rules.all[:5]]
+    words = [(word, (0, 0)) for word in ("contrary", "straight", "reverse")]
+    assert wishes == [*words, ("steer", (0, 1)), ("steer", (0, -1))]
     starts = np.array([[0.0, 0.05]] * 5 + [[0.0, 0.95]])
     programmes = np.array([[0], [1], [2], [3], [4], [1]])
     signal = Programmes(vehicle, loop, rules, programmes, segment=1)

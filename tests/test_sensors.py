@@ -310,7 +310,7 @@ def test_an_angle_in_a_log_is_one_where_the_chart_says_so(tmp_path):
     path.write_text("\n".join(["t,theta,theta_ref", *lines]))
     noise = noise_of(hyrl_mj.get_task(CIRCLE), f"log {path}", 0.0)
     assert noise.bound == pytest.approx(0.07, rel=0.05)
-    assert noise.log.worst.delay == 2
+    assert noise.worst.delay == 2
 
 
 @pytest.fixture

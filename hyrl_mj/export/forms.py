@@ -6,14 +6,15 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from runpy import run_path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hyrl_mj.errors import BadInput, brief, unknown
 from hyrl_mj.export.source import write_function
+from hyrl_mj.fields import FocusController
 from hyrl_mj.files import artifacts
-from hyrl_mj.policies import ACTIVATIONS, ON_EDGE, Controller, HybridController, MlpPolicy
+from hyrl_mj.policies import ACTIVATIONS, ON_EDGE, HybridController, MlpPolicy
 from hyrl_mj.sets import Cloud, Everything, Grid, GridSet, StateSet
 from hyrl_mj.tasks import Task
 from hyrl_mj.tracing import BATCH, trace
@@ -24,21 +25,12 @@ if TYPE_CHECKING:
 TEMPLATE = Path(__file__).parent / "templates" / "controller.py"
 
 
-class Traceable(Controller, Protocol):
-    """A controller whose step is written in NumPy's functions of arrays, such as `FocusController`."""
-
-    @property
-    def task(self) -> Task:
-        """What it controls."""
-
-    def answer(self, q: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Does `step` without checks and branches, in the initial mode where q (n,) is -1."""
-
-
+# Controllers that can be exported; the step of the second one is written in NumPy's functions of arrays.
+Exportable = HybridController | FocusController
 Step = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
-def export_numpy(controller: HybridController | Traceable, folder: str | Path) -> list[Path]:
+def export_numpy(controller: Exportable, folder: str | Path) -> list[Path]:
     """Writes a controller as controller.py and controller.npz, which need NumPy alone; returns their paths.
 
     The module has `step(q, measured) -> (u, q_next)` and `initial_mode(measured)`, as the controller does.
@@ -64,7 +56,7 @@ def export_numpy(controller: HybridController | Traceable, folder: str | Path) -
     return [folder / source.name for source in written]
 
 
-def export_onnx(controller: HybridController | Traceable, path: str | Path) -> Path:
+def export_onnx(controller: Exportable, path: str | Path) -> Path:
     """Writes a controller as one ONNX file, and returns its path: modes, sets and the jump rule in one graph.
 
     Its inputs are q (n,) int64 and measured (n, p) float64, its outputs u (n, m) float64 and q_next (n,)
@@ -130,7 +122,7 @@ def files_of(form: str, out: Path) -> list[Path]:
     return numpy_form if form == "numpy" else [out]
 
 
-def export(controller: HybridController | Traceable, form: str, out: Path) -> None:
+def export(controller: Exportable, form: str, out: Path) -> None:
     """Writes a controller in one of `FORMS`.
 
     Raises:
@@ -141,7 +133,7 @@ def export(controller: HybridController | Traceable, form: str, out: Path) -> No
     FORMS[form](controller, out)
 
 
-def _write(controller: HybridController | Traceable, folder: Path) -> tuple[Path, Path]:
+def _write(controller: Exportable, folder: Path) -> tuple[Path, Path]:
     """Writes controller.py and controller.npz."""
     text = TEMPLATE.read_text(encoding="utf-8")
     begin, end = text.index("# ---- the task"), text.index("# ---- the controller\n")
@@ -155,13 +147,12 @@ def _write(controller: HybridController | Traceable, folder: Path) -> tuple[Path
         checks = text[end : text.index("LOW, SIDES, PERIODIC =")]
         text = text[:begin] + task_part + checks + _traced_step(controller, arrays)
     path = folder / TEMPLATE.name
-    with artifacts.replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    path.write_text(text, encoding="utf-8")
     artifacts.write_arrays(path.with_suffix(".npz"), arrays, kind="controller")
     return path, path.with_suffix(".npz")
 
 
-def _traced_step(controller: Traceable, arrays: dict[str, np.ndarray]) -> str:
+def _traced_step(controller: FocusController, arrays: dict[str, np.ndarray]) -> str:
     """Returns the function `answer` of a controller that is written in NumPy's functions of arrays."""
     task, rng = controller.task, np.random.default_rng(0)
     q, measured = rng.choice((*controller.modes, -1), BATCH), _measurements(task, BATCH, rng)
@@ -269,7 +260,7 @@ def _constants(task: Task) -> str:
     return "\n".join(lines)
 
 
-def _graph(controller: HybridController | Traceable, module: dict[str, Any]) -> onnx.ModelProto:
+def _graph(controller: Exportable, module: dict[str, Any]) -> onnx.ModelProto:
     """Returns the function `answer` of an exported controller.py, a namespace, as a graph."""
     from hyrl_mj.export.graph import write_graph
 
@@ -288,12 +279,10 @@ def _graph(controller: HybridController | Traceable, module: dict[str, Any]) -> 
 def _measurements(task: Task, n: int, rng: np.random.Generator) -> np.ndarray:
     """Draws noisy measurements (n, p) from the whole chart."""
     z = task.chart.draw(n, rng)
-    plant = task.plant(n)
-    plant.set_state(*task.state(z, rng))
-    return plant.measurement + rng.uniform(-0.1, 0.1, (n, task.measurement_columns))
+    return task.placed(z, rng).measurement + rng.uniform(-0.1, 0.1, (n, task.measurement_columns))
 
 
-def _check(controller: HybridController | Traceable, step: Step, form: str) -> None:
+def _check(controller: Exportable, step: Step, form: str) -> None:
     """Raises `BadInput` where a form does not do what the controller does."""
     task, rng, wrong, rows = controller.task, np.random.default_rng(1), 0, (1, 7, 1000)
     refusal = (

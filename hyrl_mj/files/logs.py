@@ -7,7 +7,7 @@ import io
 import math
 from array import array
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,52 +19,48 @@ NEEDED = "give a CSV file with a line of names and a row for each sample"
 SHOWN = 40  # characters of a cell or a name in a message
 
 
-def read_log(
-    path: str | Path, pick: Callable[[Sequence[str]], Sequence[str]]
-) -> dict[str, np.ndarray]:
-    """Returns columns of a CSV file by their names, each (rows,); NaN where a cell is empty.
+class Log:
+    """A log whose columns have names.
 
-    Args:
+    Attributes:
         path: the file.
-        pick: returns the names of the columns to read, given all.
+        names: of its columns.
 
     Raises:
-        BadInput: the file cannot be read, or something in it cannot be used.
+        BadInput: the file cannot be read, or its first line does not name its columns.
     """
-    if not isinstance(path, str | Path):
-        raise BadInput(f"{path!r:.60} is no path of a file: {NEEDED}")
-    reader = csv.reader(io.StringIO(_text(Path(path))), strict=True, skipinitialspace=True)
-    try:
-        header = [name.strip() for name in next(reader, [])]
-        _check(path, header)
-        names = pick(header)
-        places = [header.index(name) for name in names]
-        values = [array("d") for _ in names]
-        for row in reader:
-            if not row:
-                continue
-            if len(row) != len(header):
+
+    def __init__(self, path: str | Path):
+        if not isinstance(path, str | Path):
+            raise BadInput(f"{path!r:.60} is no path of a file: {NEEDED}")
+        self.path, text = path, io.StringIO(_text(Path(path)))
+        self._reader = csv.reader(text, strict=True, skipinitialspace=True)
+        self.names = [name.strip() for name in next(self._rows(), [])]
+        _check(path, self.names)
+
+    def read(self, names: Sequence[str]) -> dict[str, np.ndarray]:
+        """Returns columns by their names, each (rows,), once; NaN where a cell is empty.
+
+        Raises:
+            BadInput: something in the file cannot be used.
+        """
+        values = {name: array("d") for name in names}
+        columns = [(self.names.index(name), name, values[name]) for name in names]
+        for row in filter(None, self._rows()):
+            where = f"{self.path}, line {self._reader.line_num}"
+            if len(row) != len(self.names):
                 raise BadInput(
-                    f"{path}, line {reader.line_num} has {len(row)} cells under {len(header)} names: "
-                    "give each row as many"
+                    f"{where} has {len(row)} cells under {len(self.names)} names: give each row as many"
                 )
-            for place, column in zip(places, values, strict=True):
-                column.append(_number(row[place], f"{path}, line {reader.line_num}", header[place]))
-    except csv.Error as error:
-        raise BadInput(f"{path} is no CSV file ({brief(error)}): {NEEDED}") from None
-    return {name: np.array(column) for name, column in zip(names, values, strict=True)}
+            for place, name, column in columns:
+                column.append(_number(row[place], where, name))
+        return {name: np.array(column) for name, column in values.items()}
 
-
-def names_of(path: str | Path) -> list[str]:
-    """Returns the names of the columns of a CSV file; raises `BadInput` as `read_log`."""
-    names: list[str] = []
-
-    def pick(header: Sequence[str]) -> Sequence[str]:
-        names.extend(header)
-        return ()
-
-    read_log(path, pick)
-    return names
+    def _rows(self) -> Iterator[list[str]]:
+        try:
+            yield from self._reader
+        except csv.Error as error:
+            raise BadInput(f"{self.path} is no CSV file ({brief(error)}): {NEEDED}") from None
 
 
 def _text(path: Path) -> str:

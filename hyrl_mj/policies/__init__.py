@@ -10,7 +10,6 @@ from hyrl_mj.policies.controllers import (
     PolicyController,
     answer,
     as_controller,
-    check_inputs,
     check_modes,
     is_memory,
     memory_at_start,
@@ -33,7 +32,6 @@ from hyrl_mj.policies.mlp import (
     ACTIVATIONS,
     BLAS,
     TORCH_NAMES,
-    MemoryPolicy,
     MlpPolicy,
     ObservationPolicy,
     Policy,
@@ -44,7 +42,6 @@ from hyrl_mj.policies.preprocessing import (
     PreprocessedPolicy,
     Preprocessing,
     as_function,
-    network,
 )
 from hyrl_mj.policies.sb3_zip import infer_algorithm
 
@@ -63,7 +60,6 @@ __all__ = [
     "Asked",
     "Controller",
     "HybridController",
-    "MemoryPolicy",
     "MlpPolicy",
     "Normalization",
     "ObservationPolicy",
@@ -77,14 +73,12 @@ __all__ = [
     "answer",
     "as_controller",
     "as_function",
-    "check_inputs",
     "check_modes",
     "from_callable",
     "infer_algorithm",
     "is_memory",
     "load_agent",
     "memory_at_start",
-    "network",
     "read_agent",
     "reopen_agent",
 ]

@@ -7,6 +7,7 @@ import inspect
 import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -100,14 +101,8 @@ def sb3_class(name: str) -> type[BaseAlgorithm]:
     from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
     from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-    module, _, attribute = name.rpartition(":")
-    if name in ALGORITHMS:
-        module, attribute = "stable_baselines3", name.upper()
-    try:
-        with trust.current_folder(module):
-            algorithm: type[BaseAlgorithm] = getattr(importlib.import_module(module), attribute)
-    except (Exception, SystemExit) as error:  # a foreign module can raise anything
-        raise BadInput(f"the algorithm {name} cannot be imported: {brief(error)}") from error
+    named = f"stable_baselines3:{name.upper()}" if name in ALGORITHMS else name
+    algorithm: type[BaseAlgorithm] = imported(named, f"the algorithm {name}")
     kinds = (OnPolicyAlgorithm, OffPolicyAlgorithm)
     if not (isinstance(algorithm, type) and issubclass(algorithm, kinds)):
         raise BadInput(
@@ -115,6 +110,20 @@ def sb3_class(name: str) -> type[BaseAlgorithm]:
             "OnPolicyAlgorithm or OffPolicyAlgorithm"
         )
     return algorithm
+
+
+def imported(name: str, what: str) -> Any:
+    """Returns the object that `module:object` names, from the current folder where it is not installed.
+
+    Raises:
+        BadInput: there is none; `what` names it.
+    """
+    module, _, attribute = name.partition(":")
+    try:
+        with trust.current_folder(module):
+            return attrgetter(attribute)(importlib.import_module(module))
+    except (Exception, SystemExit) as error:  # a foreign module can raise anything
+        raise BadInput(f"{what} cannot be imported: {brief(error)}") from error
 
 
 def remember(name: str) -> None:

@@ -1,16 +1,14 @@
 """External agents, which `robustify` starts from: how they are read, described and stored."""
 
-import importlib
 from dataclasses import dataclass, field, replace
 from hashlib import sha256
-from operator import attrgetter
 from pathlib import Path
 from typing import cast
 
 import numpy as np
 
-from hyrl_mj.errors import BadArtifact, BadInput, brief, check_seed, unknown
-from hyrl_mj.files import artifacts, trust
+from hyrl_mj.errors import BadArtifact, BadInput, check_seed, unknown
+from hyrl_mj.files import artifacts
 from hyrl_mj.policies import algorithms
 from hyrl_mj.policies.controllers import PolicyController, is_memory, memory_at_start
 from hyrl_mj.policies.functions import PythonAgent, declares_memory, from_callable
@@ -141,16 +139,11 @@ def agent_at(path: Path) -> AnyPolicy:
         BadArtifact: there is no such file.
         BadInput: there is no such module or object, or it can be no agent.
     """
-    module, colon, name = str(path).partition(":")
-    if not colon or path.exists():
+    if ":" not in str(path) or path.exists():
         with artifacts.reading(path, REMEDY):
             path.stat()
         return path
-    try:
-        with trust.current_folder(module):
-            agent = attrgetter(name)(importlib.import_module(module))
-    except (Exception, SystemExit) as error:  # a foreign module can raise anything
-        raise BadInput(f"the agent {path} cannot be imported: {brief(error)}") from error
+    agent = algorithms.imported(str(path), f"the agent {path}")
     if not callable(agent) and not callable(getattr(agent, "act", getattr(agent, "predict", None))):
         raise BadInput(
             f"the agent {path} is of type {type(agent).__name__}: name a function of observations, or an "
@@ -224,7 +217,7 @@ def _load(
     if path.suffix == ".onnx":
         if stochastic or activation is not None:
             raise BadInput("an .onnx file acts as it is: give neither an activation nor stochastic")
-        policy = from_onnx(path, task, REMEDY, n_stack)
+        policy = from_onnx(path, task, n_stack)
     else:
         if path.suffix == ".safetensors":
             mlp = MlpPolicy.load(path, task, n_stack)

@@ -8,6 +8,7 @@ from typing import Any, Protocol, cast
 import numpy as np
 
 from hyrl_mj.errors import BadInput, brief
+from hyrl_mj.policies import sb3_metadata
 from hyrl_mj.policies.mlp import MemoryPolicy, ObservationPolicy
 from hyrl_mj.tasks import Task, at_levels, get_task
 
@@ -223,15 +224,6 @@ def _predicting(model: Predicts, task: Task) -> FunctionPolicy | RememberingPoli
 
 def _check_model(model: Any, task: Task) -> None:
     """Raises `BadInput` if an SB3 model was trained on other observations or inputs than those of a task."""
-    normalizer = getattr(model, "get_vec_normalize_env", lambda: None)()
-    # A loaded model has no environment; it has kept what its last one observed beside VecNormalize.
-    kept = getattr(model, "get_env", lambda: None)() is None
-    kept = kept and getattr(model, "_last_original_obs", None) is not None
-    if kept or (normalizer is not None and normalizer.norm_obs):
-        raise BadInput(
-            "the model was trained under VecNormalize, and would be asked about plain observations: give its "
-            "zip with vecnormalize=, or an object that normalises as its training did and asks the model"
-        )
     observations = getattr(getattr(model, "observation_space", None), "shape", None)
     size = len(task.observation_low)
     if observations and observations != (size,):
@@ -239,6 +231,7 @@ def _check_model(model: Any, task: Task) -> None:
             f"the model observes {observations}, and {task.name} gives ({size},): train it on that, or give "
             "a function that makes its observations"
         )
+    sb3_metadata.check_model(model, task)
     space: Any = getattr(model, "action_space", None)
     levels = task.input_levels
     if levels is not None and getattr(space, "n", len(levels)) != len(levels):

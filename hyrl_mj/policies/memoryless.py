@@ -8,8 +8,7 @@ is examined, than on a robot. `check_memoryless` tries one when it is accepted;
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -35,8 +34,8 @@ RUNS, SAMPLES, SOME = 16, 64, 4
 # Sums of 256 numbers in another order differ by some 16 roundings of float32; a network has a few of them.
 ROUNDING = 32 * float(np.finfo(np.float32).eps)
 
-# Returns answers (n, m + k) to n measurements, of the given rows of some table, moved by (n, p).
-Ask = Callable[[np.ndarray, np.ndarray], np.ndarray]
+# Returns answers (n, m + k) to what is asked: arrays of n rows, the last two measurements and memories.
+Ask = Callable[..., np.ndarray]
 
 
 def draws(policy: object) -> bool:
@@ -92,46 +91,41 @@ def answers(
     return u, memory
 
 
-class _Trial:
-    """The trial of one policy.
+# Measurements (n, p) that were asked about together, memories (n, ...) with them, and the first answers
+# (n, m + k) to them: inputs, and the numbers of the next memories.
+Batch = tuple[np.ndarray, np.ndarray, np.ndarray]
 
-    Attributes:
-        batches: the measurements (n, p) that were asked about together.
-        memories: the memories (n, ...) with them.
-        answers: the first answers (n, m + k) to them: inputs, and the numbers of the next memories.
-    """
+
+class _Trial:
+    """The trial of one policy."""
 
     def __init__(self, policy: Policy, task: Task, name: str):
         self.policy, self.task, self.name = policy, task, name
-        self.batches: list[np.ndarray] = []
-        self.memories: list[np.ndarray] = []
-        self.answers: list[np.ndarray] = []
+        self.asked: list[Batch] = []
         self._before = (np.zeros(0), np.zeros(0))  # the latest answer, and a copy of it
-        low, high = task.input_limits
-        self._span = np.zeros_like(low) if task.input_levels is not None else high - low
+        self._span = _span(task)
 
     def run(self) -> None:
         self._act()
-        for k in reversed(range(len(self.batches))):
-            self._again(k, "asked again later")
-        rows, memory = np.concatenate(self.batches), np.concatenate(self.memories)
-        first, rng = np.concatenate(self.answers), np.random.default_rng(1)
-        whole = np.arange(len(rows))
-        ends = np.cumsum([len(batch) for batch in self.batches])
+        for batch in reversed(self.asked):
+            self._compare(batch, "asked again later", again=True)
+        measured, memory, first = map(np.concatenate, zip(*self.asked, strict=True))
+        rng, whole = np.random.default_rng(1), np.arange(len(measured))
+        ends = np.cumsum([len(rows) for rows, _, _ in self.asked])
         orders = [whole, rng.permutation(whole)]
-        orders += np.array_split(rng.permutation(whole), max(len(rows) // 3, 1))[: SAMPLES // SOME]
-        for batch, end in zip(self.batches[::SOME], ends[::SOME], strict=True):
-            others = rng.choice(whole, len(batch) - 1)
-            orders.append(np.append(end - len(batch), others))
+        orders += np.array_split(rng.permutation(whole), max(len(whole) // 3, 1))[: SAMPLES // SOME]
+        for (rows, _, _), end in zip(self.asked[::SOME], ends[::SOME], strict=True):
+            others = rng.choice(whole, len(rows) - 1)
+            orders.append(np.append(end - len(rows), others))
         for order in orders:
-            again = self._ask(rows[order], memory[order])
-            self._compare(rows, memory, first, order, again, f"in a batch of {len(order)}")
-        one = np.empty((1, rows.shape[1]))
-        for i in rng.permutation(len(rows))[:128, None]:
-            one[:] = rows[i]
-            self._compare(rows, memory, first, i, self._ask(one, memory[i]), "alone")
-        for k in range(0, len(self.batches), SOME):
-            self._again(k, f"asked again after {len(rows)} others")
+            batch = measured[order], memory[order], first[order]
+            self._compare(batch, f"in a batch of {len(order)}")
+        one = np.empty((1, measured.shape[1]))
+        for i in rng.permutation(len(whole))[:128, None]:
+            one[:] = measured[i]
+            self._compare((one, memory[i], first[i]), "alone")
+        for batch in self.asked[::SOME]:
+            self._compare(batch, f"asked again after {len(whole)} others", again=True)
 
     def _act(self) -> None:
         """Acts in runs from the start distribution; what has ended begins anew once all have."""
@@ -146,16 +140,16 @@ class _Trial:
                 plant.set_state(*task.state(task.starts(RUNS, rng), rng))
                 measured, active = plant.measurement, np.arange(RUNS)
                 memory = memory_at_start(PolicyController(self.policy), RUNS)
-            self.batches.append(measured[active])
-            self.memories.append(memory[active])
-            self.answers.append(self._ask(self.batches[-1], self.memories[-1]))
-            memory[active] = self.answers[-1][:, m:].reshape(self.memories[-1].shape)
+            asked = measured[active], memory[active]
+            answered = self._ask(*asked)
+            self.asked.append((*asked, answered))
+            memory[active] = answered[:, m:].reshape(asked[1].shape)
             if k % 8 == 0:  # inputs are held for so many samples
                 low, high = task.input_limits
                 drawn = rng.uniform(low, high, (RUNS, len(low)))
             mine = (active < RUNS // 2)[:, None]
             try:
-                plant.step(np.where(mine, self.answers[-1][:, :m], drawn[active]), active)
+                plant.step(np.where(mine, answered[:, :m], drawn[active]), active)
             except BadInput:  # inputs beyond the limits are named where a run is really made
                 active = active[:0]
 
@@ -170,76 +164,64 @@ class _Trial:
         self._before = u, u.copy()
         return np.column_stack([u.astype(float), after.reshape(len(u), -1)])
 
-    def _again(self, k: int, words: str) -> None:
-        """Asks about a batch as it was asked about first, where not even sums differ."""
-        rows, memory, first = self.batches[k], self.memories[k], self.answers[k]
-        compare(self.name, rows, first, self._ask(rows, memory), self._span, words)
+    def _compare(self, batch: Batch, words: str, again: bool = False) -> None:
+        *asked, first = batch
+        compare(self.name, self._ask, asked, first, self._span, words, again)
 
-    def _compare(
-        self,
-        rows: np.ndarray,
-        memory: np.ndarray,
-        first: np.ndarray,
-        chosen: np.ndarray,
-        again: np.ndarray,
-        words: str,
-    ) -> None:
-        """Compares answers to `chosen` rows (k,) with those of before."""
 
-        def ask(some: np.ndarray, shift: np.ndarray) -> np.ndarray:
-            at = chosen[some]
-            pairs = zip((rows[at] + shift)[:, None], memory[at, None], strict=True)
-            return np.concatenate([self._ask(*pair) for pair in pairs])
-
-        compare(self.name, rows[chosen], first[chosen], again, self._span, words, ask)
+def _span(task: Task) -> np.ndarray:
+    """Returns the range of the inputs (m,); of levels, which do not round, zero."""
+    low, high = task.input_limits
+    return np.zeros_like(low) if task.input_levels is not None else high - low
 
 
 def compare(
     name: str,
-    rows: np.ndarray,
+    ask: Ask,
+    asked: Sequence[np.ndarray],
     first: np.ndarray,
-    again: np.ndarray,
     span: np.ndarray,
     words: str,
-    ask: Ask | None = None,
+    again: bool,
 ) -> None:
-    """Compares two answers (n, m + k) to the same measurements `rows` (n, p): inputs, and next memories.
+    """Asks once more, and compares the answers (n, m + k), inputs and next memories, with the first ones.
 
     Inputs may differ by roundings of their `span` (m,), the range of the inputs, and memories by those of
-    their largest number. With `ask`, which asks about one measurement at a time, also by as much as the
-    answer changes within roundings of the measurement: where it is steep, or where two levels tie.
+    their largest number. Unless it is asked `again`, where not even sums differ, also by as much as the
+    answer to a single measurement changes within roundings of it: where it is steep, or where two levels tie.
 
     Raises:
         BadInput: they differ by more.
     """
-    m = len(span)
+    later, (*others, rows, memory), m = ask(*asked), asked, len(span)
     largest = np.nan_to_num(np.abs(first[:, m:])).max(initial=0.0)
     margin = ROUNDING * np.append(span, np.full(first.shape[1] - m, largest))
-    off = np.nan_to_num(np.abs(again - first)) - margin
+    off = np.nan_to_num(np.abs(later - first)) - margin
     if not (off > 0).any():
         return
     # A larger difference is a rounding, too, where the answer changes as much over one of the measurement.
     for i in np.argsort(-off.max(axis=1))[:4]:
-        if ask is not None:
+        if not again:
             # A network rounds sums of all that it sees, also where a column is zero.
             size = np.abs(rows).max(axis=0)
             signs = np.random.default_rng(0).uniform(-1, 1, (32, len(size)))
             shifts = np.vstack([np.zeros_like(size), ROUNDING * size * signs])
-            near = ask(np.full(len(shifts), i), shifts)
+            alone, kept = [values[[i]] for values in others], memory[[i]]
+            near = np.concatenate([ask(*alone, rows[[i]] + shift, kept) for shift in shifts])
             off[i] -= np.abs(near - near[0]).max(axis=0)
         if (off[i] > 0).any():
             shown, what = slice(m), ""
             if not (off[i, :m] > 0).any():
                 shown, what = slice(off[i].argmax(), off[i].argmax() + 1), "a memory of "
-            alone = "observation alone, without chance or memory"
+            needed = "observation alone, without chance or memory"
             if m < first.shape[1]:
-                alone = (
+                needed = (
                     "observation and the memory that it is given, without chance or another memory"
                 )
             raise BadInput(
                 f"{name} answers the measurement {_row(rows[i])} with {what}{_row(first[i, shown])} and, "
-                f"{words}, with {what}{_row(again[i, shown])}: give one whose answer depends on its own "
-                f"{alone}"
+                f"{words}, with {what}{_row(later[i, shown])}: give one whose answer depends on its own "
+                f"{needed}"
             )
 
 
@@ -247,27 +229,20 @@ def _row(values: np.ndarray) -> str:
     return "(" + ", ".join(f"{value:.7g}" for value in values) + ")"
 
 
-@dataclass
 class Asked:
-    """A controller in a closed loop, which at its end is asked again about some of what it has answered.
+    """A controller in a closed loop, which at its end is asked again about some of what it has answered."""
 
-    Attributes:
-        task: the task.
-        controller: the controller.
-    """
-
-    task: Task
-    controller: Controller
-    _kept: list[tuple[np.ndarray, ...]] = field(default_factory=list)
-    _few: list[tuple[np.ndarray, ...]] = field(default_factory=list)
-    _next: int = 0
+    def __init__(self, task: Task, controller: Controller):
+        self._task, self._controller, self._next = task, controller, 0
+        self._kept: list[tuple[np.ndarray, ...]] = []
+        self._few: list[tuple[np.ndarray, ...]] = []
 
     def __call__(
         self, k: int, q: np.ndarray, measured: np.ndarray, memory: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns inputs (n, m), next modes (n,) and memories (n, ...) at sample k of runs, as `answer`."""
-        answered = answer(self.controller, q, measured, memory)
-        check_inputs(answered[0], len(measured), len(self.task.inputs))
+        answered = answer(self._controller, q, measured, memory)
+        check_inputs(answered[0], len(measured), len(self._task.inputs))
         # Samples 0, 1, 4, 16, ...; with many runs, which takes longer, few of them after the first two.
         if k == self._next:
             rows = (q, measured, memory, _beside(answered))
@@ -283,28 +258,21 @@ class Asked:
         Raises:
             BadInput: an answer is another one.
         """
-        controller = self.controller
-        if isinstance(controller, PolicyController) and draws(controller.policy):
-            return
-        low, high = self.task.input_limits
-        span = np.zeros_like(low) if self.task.input_levels is not None else high - low
-        span, name, words = np.append(span, 0.0), "the controller", "asked again later"
+        controller, name = self._controller, "the controller"
         if isinstance(controller, PolicyController):
+            if draws(controller.policy):
+                return
             name = getattr(controller.policy, "name", "the policy")
+        span = np.append(_span(self._task), 0.0)
+
+        def ask(*asked: np.ndarray) -> np.ndarray:
+            return _beside(answer(controller, *asked))
+
         for *asked, first in reversed(self._kept):
-            again = _beside(answer(controller, *asked))
-            compare(name, asked[1], first, again, span, words)
-        if not self._few:
-            return
-        q, measured, memory, first = map(np.concatenate, zip(*self._few, strict=True))
-
-        def ask(rows: np.ndarray, shift: np.ndarray) -> np.ndarray:
-            moved = measured[rows] + shift
-            alone = zip(q[rows, None], moved[:, None], memory[rows, None], strict=True)
-            return np.concatenate([_beside(answer(controller, *one)) for one in alone])
-
-        again = _beside(answer(controller, q, measured, memory))
-        compare(name, measured, first, again, span, f"in a batch of {len(q)}", ask)
+            compare(name, ask, asked, first, span, "asked again later", again=True)
+        if self._few:
+            *asked, first = map(np.concatenate, zip(*self._few, strict=True))
+            compare(name, ask, asked, first, span, f"in a batch of {len(first)}", again=False)
 
 
 def _beside(answered: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:

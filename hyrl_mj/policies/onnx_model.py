@@ -11,6 +11,7 @@ import numpy as np
 from hyrl_mj.errors import BadArtifact, BadInput
 from hyrl_mj.files import artifacts
 from hyrl_mj.policies.functions import FunctionPolicy
+from hyrl_mj.policies.sb3_zip import REMEDY
 from hyrl_mj.system import limits
 from hyrl_mj.tasks import Task
 
@@ -18,7 +19,7 @@ from hyrl_mj.tasks import Task
 ROWS = 1024
 
 
-def from_onnx(path: Path, task: Task, remedy: str, n_stack: int = 1) -> FunctionPolicy:
+def from_onnx(path: Path, task: Task, n_stack: int) -> FunctionPolicy:
     """Returns the policy of an ONNX file, after a first call of it.
 
     The model sees `n_stack` observations at once.
@@ -27,7 +28,7 @@ def from_onnx(path: Path, task: Task, remedy: str, n_stack: int = 1) -> Function
         if find_spec(package) is None:
             raise BadInput(f'an .onnx file needs {package}: pip install "hyrl-mj[onnx]"')
     columns = n_stack * len(task.observation_low)
-    with artifacts.reading(path, remedy):
+    with artifacts.reading(path, REMEDY):
         model = artifacts.read_limited(path, 2**25)  # the largest MLP policies take a few megabytes
         found = _examined(model, columns, task)
         from hyrl_mj.policies.onnx_trial import session_of  # slow to import, and only needed here

@@ -75,14 +75,13 @@ class Normalization:
                 arrays = archives.read_npz(content, 2**20)
             if by_key := any(name.startswith(("mean.", "var.")) for name in arrays):
                 arrays = _joined(arrays, parts, n_stack)
-            if missing := [name for name in _FIELDS[:3] if name not in arrays]:
+            arrays = {"epsilon": np.array(Normalization.epsilon), **arrays}
+            if missing := [name for name in _FIELDS if name not in arrays]:
                 raise BadArtifact(f"it has no array {' and no '.join(missing)}: {RECIPE}")
-            found = {n: np.asarray(arrays[n]) for n in _FIELDS if n in arrays}
+            found = {name: np.asarray(arrays[name]) for name in _FIELDS}
             if other := [n for n, array in found.items() if array.dtype.kind not in "biuf"]:
                 raise BadArtifact(f"its {other[0]} holds no numbers: {RECIPE}")
-            values = {n: array.astype(float) for n, array in found.items()}
-            mean, var, clip = (values[name] for name in _FIELDS[:3])
-            epsilon = values.get("epsilon", np.array(Normalization.epsilon))
+            mean, var, clip, epsilon = (array.astype(float) for array in found.values())
             if mean.ndim != 1 or var.shape != mean.shape or clip.size != 1 or epsilon.size != 1:
                 raise BadArtifact(
                     f"its mean and var are two rows of numbers, clip is one number: {RECIPE}"

@@ -8,7 +8,6 @@ sample earlier in its place. Under it PPO and A2C keep the very first.
 from __future__ import annotations
 
 import base64
-import binascii
 import re
 from collections.abc import Mapping
 from functools import cached_property
@@ -68,9 +67,7 @@ def _box(low: np.ndarray, high: np.ndarray) -> str:
     return " x ".join(text + ["..."] * (max(len(low), len(high)) > 6))
 
 
-def check_observations(
-    about: Mapping[str, Any], task: Task, on_policy: bool, n_stack: int = 1
-) -> None:
+def check_observations(about: Mapping[str, Any], task: Task, on_policy: bool, n_stack: int) -> None:
     """Raises `BadArtifact` unless the metadata show that an agent was trained on plain observations.
 
     `on_policy` tells PPO and A2C from the others; `n_stack` is the number of observations that it sees.
@@ -78,12 +75,13 @@ def check_observations(
     if about.get("num_timesteps") == 0:
         return  # it has not been trained
     last, original = (
-        _observations(about, f"_last_{name}", task) for name in ("obs", "original_obs")
+        _observations(_decoded(about.get(f"_last_{name}")), task)
+        for name in ("obs", "original_obs")
     )
     possible, normalized = _Possible(task), None
     if on_policy and "_last_original_obs" in about and about["_last_original_obs"] is None:
         normalized = False  # under VecNormalize SB3 keeps it from the first observation on
-    elif last is not None and original is not None and _sizes(last) == _sizes(original):
+    elif last is not None and original is not None:
         normalized = _normalized(last, original, possible, on_policy, n_stack)
         if normalized:
             raise BadArtifact(
@@ -95,6 +93,30 @@ def check_observations(
         raise BadArtifact(
             "nothing in it tells whether it was trained on normalised observations (VecNormalize), as "
             f"would change its inputs: {HOW}"
+        )
+
+
+def check_model(model: Any, task: Task) -> None:
+    """Raises `BadInput` unless a model of SB3, if it is one, was trained on plain observations."""
+    normalizer = getattr(model, "get_vec_normalize_env", lambda: None)()
+    original = getattr(model, "_last_original_obs", None)
+    normalized: bool | None = normalizer is not None and normalizer.norm_obs
+    if getattr(model, "get_env", lambda: None)() is None and original is not None:
+        # A loaded model has no environment; it has kept what its last one observed.
+        last, before = (_observations(found, task) for found in (model._last_obs, original))
+        normalized, on_policy = None, hasattr(model, "rollout_buffer")
+        if last is not None and before is not None:
+            normalized = _normalized(last, before, _Possible(task), on_policy, 1)
+    if normalized:
+        raise BadInput(
+            "the model was trained under VecNormalize, and would be asked about plain observations: give its "
+            "zip with vecnormalize=, or an object that normalises as its training did and asks the model"
+        )
+    if normalized is None:
+        raise BadInput(
+            "nothing in the model tells whether it was trained on observations that VecNormalize normalised, "
+            "or whether that normalised rewards alone, if anything: load it with the environment of its "
+            'training, as load(path, env=env), or give its zip with vecnormalize="none" if it saw plain ones'
         )
 
 
@@ -114,7 +136,7 @@ def _check_wrappers(about: Mapping[str, Any], last: _Parts | None, possible: _Po
     which, types = "", {str(part.dtype) for part in (last or {}).values()}
     space = about.get("observation_space")
     limits = [_numbers(space, end) if isinstance(space, dict) else None for end in ("low", "high")]
-    ours = np.array([task.observation_low, task.observation_high], dtype=float)
+    ours = possible.limits
     if joined is not None and given is False:
         which = f"its last one is {_row(joined)}, which {task.name} never gives"
     elif task.observation_dtype == "float64" and "float32" in types:
@@ -137,6 +159,9 @@ def _normalized(
 
     None if that cannot be told.
     """
+    shapes = [{name: part.shape for name, part in parts.items()} for parts in (last, original)]
+    if shapes[0] != shapes[1]:
+        return None
     open_columns: list[bool] = []
     for name, after in last.items():
         before = original[name]
@@ -151,33 +176,33 @@ def _normalized(
     return possible.normalized(_joined(last), _joined(original), on_policy, np.array(open_columns))
 
 
-def _observations(about: Mapping[str, Any], key: str, task: Task) -> _Parts | None:
-    """Returns the observations in an entry of the metadata; None if there are none of this task.
+def _decoded(found: Any) -> Any:
+    """Returns the array, or the arrays of a Dict, in an entry of the metadata; None if there are none."""
+    text: Any = found.get(":serialized:") if isinstance(found, dict) else None
+    try:
+        arrays = pickled.arrays(base64.b64decode(text, validate=True))
+    except (TypeError, ValueError):
+        return None
+    return arrays.get("", arrays)
+
+
+def _observations(found: Any, task: Task) -> _Parts | None:
+    """Returns the observations of this task in an array, or in those of a Dict; None if there are none.
 
     Of stacked observations these are the latest.
     """
-    found = about.get(key)
-    text = found.get(":serialized:") if isinstance(found, dict) else None
-    if not isinstance(text, str):
-        return None
-    try:
-        found = pickled.arrays(base64.b64decode(text, validate=True))
-    except (binascii.Error, ValueError):
-        return None
-    sizes = {"": len(task.observation_low)} if "" in found else task.observation_parts
+    sizes = task.observation_parts
+    if isinstance(found, np.ndarray):
+        found, sizes = {"": found}, {"": len(task.observation_low)}
     latest = {}
     for name, size in sizes.items():
-        part = found.get(name)
+        part = found.get(name) if isinstance(found, dict) else None
         if part is None or part.ndim != 2 or not part.size or part.shape[1] % size:
             return None
         latest[name] = part[:, -size:]
     if len({len(part) for part in latest.values()}) != 1:
         return None
     return latest if all(np.isfinite(part).all() for part in latest.values()) else None
-
-
-def _sizes(parts: _Parts) -> dict[str, tuple[int, ...]]:
-    return {name: part.shape for name, part in parts.items()}
 
 
 def _joined(parts: _Parts) -> np.ndarray:
@@ -193,29 +218,24 @@ class _Possible:
 
     def __init__(self, task: Task):
         self.task, self._rng = task, np.random.default_rng(0)
-
-    @cached_property
-    def _plant(self) -> Any:
-        """Copies of the robot, until `by_step` at its start."""
-        return self.task.placed(self.task.starts(256, self._rng), self._rng)
-
-    @cached_property
-    def _measured(self) -> np.ndarray:
-        return np.asarray(self._plant.measurement)
+        self.limits = np.array([task.observation_low, task.observation_high], dtype=float)
 
     @cached_property
     def starts(self) -> np.ndarray:
         """Observations (n, k) where episodes start."""
+        # Copies of the robot, until `by_step` there.
+        self._plant = self.task.placed(self.task.starts(256, self._rng), self._rng)
+        self._measured = np.asarray(self._plant.measurement)
         return self.task.observation(self._measured)
 
     @cached_property
     def by_noise(self) -> np.ndarray:
         """The largest difference (k,) between two observations that noise makes."""
-        shares = np.array(self.task.noisy, dtype=float)
+        starts, shares = self.starts, np.array(self.task.noisy, dtype=float)
         # A training may have had noise on the measurements of 0.1, in the units of the chart.
         noise = self._rng.uniform(-0.1, 0.1, self._measured.shape) * shares
         noisy = self.task.observation(self._measured + noise)
-        return np.asarray(2 * np.abs(noisy - self.starts).max(axis=0))
+        return np.asarray(2 * np.abs(noisy - starts).max(axis=0))
 
     @cached_property
     def by_step(self) -> np.ndarray:
@@ -231,34 +251,23 @@ class _Possible:
             before = after
         return longest
 
-    @cached_property
-    def _inverts(self) -> bool:
-        """Whether the task tells what was measured from what was observed."""
-        try:
-            self.task.measured(np.zeros((1, len(self.task.observation_low))))
-        except BadInput:
-            return False
-        return True
-
-    @property
-    def _limits(self) -> np.ndarray:
-        return np.array([self.task.observation_low, self.task.observation_high], dtype=float)
-
     @property
     def slack(self) -> np.ndarray:
         """How far observations (k,) may lie beyond those that were found."""
-        low, high = self._limits
+        low, high = self.limits
         return np.asarray(self.by_noise + self.by_step + 1e-3 * (high - low))
 
     def include(self, last: np.ndarray) -> bool | None:
         """Returns whether a task gives such observations (n, k); None if that cannot be told."""
-        low, high = self._limits
+        low, high = self.limits
         outside = (
             (last < low) | (last > high)
         ).any()  # else the slack, which takes long, is not needed
         if outside and ((last < low - self.slack) | (last > high + self.slack)).any():
             return False
-        if not self._inverts:
+        try:
+            self.task.measured(np.zeros((1, len(low))))
+        except BadInput:  # it does not tell what was measured
             return None
         tolerance = ROUNDING + 5 * self._off(self.starts.astype(np.float32)).max()
         if np.median(self._off(0.7 * self.starts + 0.1)) <= tolerance:

@@ -1,17 +1,11 @@
 """Simulation: the closed loop of plant, measurement noise and controller, in batches.
 
 `closed_loop` runs many episodes at once; `simulate` returns them as hybrid arcs. Each kind of measurement
-noise is a class of its own, a `Signal`, that `register_noise` registers by its name. Every module of this
-folder is imported, so that a new kind of noise takes one new file.
+noise is a class of its own, a `Signal`, that `register_noise` registers by its name.
 """
 
-from importlib import import_module
-from pkgutil import iter_modules
-
 from hyrl_mj.simulation.arc import LONGEST, HybridArc, samples, simulate, simulate_batch
-from hyrl_mj.simulation.attack_settings import AttackSettings
 from hyrl_mj.simulation.checked_noise import drawn
-from hyrl_mj.simulation.logged import Logged, NamedNoise, noise_of
 from hyrl_mj.simulation.lookahead import Ahead, Lookahead
 from hyrl_mj.simulation.noise import (
     KINDS,
@@ -27,12 +21,12 @@ from hyrl_mj.simulation.noise import (
     signal_for,
     try_signal,
 )
-from hyrl_mj.simulation.noise_of_logs import ColumnNoise, LogNoise, noise_from_log
+from hyrl_mj.simulation.noise_of_logs import LogNoise, NamedNoise, noise_from_log, noise_of
 from hyrl_mj.simulation.passing import Passing, windings
 from hyrl_mj.simulation.programmes import GIVEN, Programmes
 from hyrl_mj.simulation.real import judge, judge_task
 from hyrl_mj.simulation.rollout import LoopSettings, Rollout, closed_loop
-from hyrl_mj.simulation.rules import Rule, Rules
+from hyrl_mj.simulation.rules import AttackSettings, Rules
 from hyrl_mj.simulation.sensors import Sensor, covers_sensor, usual_kinds
 from hyrl_mj.simulation.way_runs import WayRuns, policy_runs, way_runs
 
@@ -45,10 +39,8 @@ __all__ = [
     "Ahead",
     "AnyNoise",
     "AttackSettings",
-    "ColumnNoise",
     "HybridArc",
     "LogNoise",
-    "Logged",
     "Lookahead",
     "LoopSettings",
     "NamedNoise",
@@ -57,7 +49,6 @@ __all__ = [
     "Programmes",
     "Recorded",
     "Rollout",
-    "Rule",
     "Rules",
     "Sample",
     "Sensor",
@@ -82,6 +73,3 @@ __all__ = [
     "way_runs",
     "windings",
 ]
-
-for _module in iter_modules(__path__, f"{__name__}."):
-    import_module(_module.name)

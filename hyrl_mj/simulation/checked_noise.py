@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+from copy import deepcopy
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -67,6 +69,13 @@ def is_own(signal: Signal) -> bool:
     """Returns whether the class of a signal is of this package, and of all signals that it is made of."""
     own = type(signal).__module__.startswith("hyrl_mj.")
     return own and all(map(is_own, getattr(signal, "noises", ())))
+
+
+def twin_of(signal: Signal, *kept: object) -> Signal | None:
+    """Returns a copy of a signal of a user's class, which keeps some objects; None if it cannot be copied."""
+    with suppress(Exception):  # a user's object can raise anything
+        return None if is_own(signal) else deepcopy(signal, {id(one): one for one in kept})
+    return None
 
 
 def check_repeats(signal: Signal, noise: np.ndarray, twin: Signal, now: Sample) -> None:

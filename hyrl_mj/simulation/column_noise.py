@@ -114,33 +114,25 @@ def column_noise(
     Raises:
         BadInput: the measurement has another unit than its reference.
     """
-    from scipy import stats  # slow to import
-
     known = np.isfinite(y)
     if known.sum() < LEAST:
         return ColumnNoise(name, remarks=(f"{name} has fewer than {LEAST} numbers",))
     tiny = 1e-9 * float(np.nanmax(np.abs(y)))  # more than the rounding of floats does
     if np.ptp(y[known]) <= tiny:
         return ColumnNoise(name, remarks=(f"{name} never changes, so its noise cannot be told",))
-    remarks = ["without a reference, bias and delay cannot be told"] if r is None else []
-    if r is None:
-        reference = np.full(len(y), np.median(y[known]))
-    else:
-        reference = r
+    if r is not None:
         _check_units(name, y, r)
         if not turn:
             _check_turns(name, y - r)
-    last = np.maximum.accumulate(np.where(known, np.arange(len(y)), 0))
-    again = ~known | (np.abs(y - np.concatenate([y[:1], y[last[:-1]]])) <= tiny)
-    # Before the robot moves its measurement may be the same without being held.
-    rests = np.append(True, np.abs(np.diff(reference)) <= tiny)
-    again[: np.argmin((again & rests) | (np.arange(len(y)) <= np.argmax(known)))] = False
+    reference = np.full(len(y), np.median(y[known])) if r is None else r
+    again = _again(y, known, reference, tiny)
     quantum = _quantum(y[known & ~again], int(known.sum()), tiny)
     # A quantum repeats measurements, too: held are those which are repeated where the reference moves on.
-    fresh, delay, said = known if quantum else known & ~again, nan, list[str]()
+    fresh, delay = known if quantum else known & ~again, nan
+    remarks = ["without a reference, bias and delay cannot be told"]
     for _ in range(2 if quantum else 1):
         if r is not None:
-            delay, said = _delay(name, y, r, fresh, turn)
+            delay, remarks = _delay(name, y, r, fresh, turn)
         late = _shifted(reference, 0 if np.isnan(delay) else int(delay))
         raw = wrapped(y - late) if turn else y - late
         used = fresh & np.isfinite(raw)
@@ -151,55 +143,70 @@ def column_noise(
         slow, drift, rate, unsure = _drift(np.where(used, kept, nan), dt, tiny)
         left = raw - slow
         sigma, bound, uniform = _noise_left(left[used], quantum, share, tiny, drift)
-        repeated = _repeated(late + slow, left[used], sigma, quantum, tiny)
-        moves = repeated < 0.5
-        by_chance = float(np.mean(repeated[moves])) if moves.any() else 1.0
-        # Where between two steps of a quantum the reference lies is known to about a hundredth.
-        by_chance = max(by_chance, 0.01 if quantum else 0.0)
+        moves, by_chance = _moves(late + slow, left[used], sigma, quantum, tiny)
         held, held_rate = _held(again, moves & np.isfinite(t), by_chance)
         fresh = known & ~(again & moves) if held else fresh
     if moves.sum() < 0.5 * known.sum():
-        said = [*said, f"{name} moves too little between samples for held ones to be told"]
+        remarks.append(f"{name} moves too little between samples for held ones to be told")
         held, held_rate = 0, 0.0
-    if r is not None:
-        remarks += [*said, *([] if turn else _slope(name, y[used], late[used]))]
-    else:
-        remarks += said
+    if r is not None and not turn:
+        remarks += _slope(name, y[used], late[used])
     correlations = _autocorrelation(left, used)
-    middle = sum(np.quantile(slow, ENDS)) / 2
-    correlation = float(correlations[1])
-    if bound and abs(correlation) > max(0.2, stats.norm.isf(CHANCE) / np.sqrt(used.sum())):
-        steps = np.abs(np.diff(left))
-        fast = np.nanquantile(steps[used[1:] & used[:-1]], 0.95) / dt
-        remarks.append(
-            f"what is left of {name} is correlated from sample to sample ({correlation:.2f}): "
-            f"drift {bound:.3g} rate {fast:.3g} describes it better"
-        )
+    remarks += _correlated(name, float(correlations[1]), left, used, bound, dt)
     if unsure:
         remarks.append(f"the drift of {name} is too small in its noise for its rate to be sure")
     if (over := np.abs(left[used]).max()) > 2 * (bound + quantum / 2 + drift / 20) + tiny:
         remarks.append(f"some samples of {name} are beyond the bound, the farthest by {over:.3g}")
+    bias = nan if r is None else float(sum(np.quantile(slow, ENDS)) / 2)
     unsure_bias = max(3 * sigma / np.sqrt(used.sum()), drift / 20, quantum / 20)
     return ColumnNoise(
         name,
-        delay=delay if r is not None else nan,
+        delay=delay,
         held=held,
         held_rate=held_rate,
         quantum=quantum if quantum > sigma / 100 else 0.0,  # a smaller one changes nothing
-        bias=nan if r is None else float(middle),
-        told_bias=abs(float(middle)) if r is not None and abs(middle) > unsure_bias else 0.0,
+        bias=bias,
+        told_bias=abs(bias) if abs(bias) > unsure_bias else 0.0,
         drift=drift,
         drift_rate=rate,
         bound=bound,
         sigma=sigma,
         uniform=uniform,
-        correlation=correlation,
+        correlation=float(correlations[1]),
         remarks=tuple(remarks),
         times=t[used],
         errors=raw[used],
         slow=slow[used],
         correlations=correlations,
     )
+
+
+def _again(y: np.ndarray, known: np.ndarray, reference: np.ndarray, tiny: float) -> np.ndarray:
+    """Returns which measurements (n,) are those before them, or unknown: (n,) bool.
+
+    Before the robot moves its measurement may be the same without being held.
+    """
+    last = np.maximum.accumulate(np.where(known, np.arange(len(y)), 0))
+    again = ~known | (np.abs(y - np.concatenate([y[:1], y[last[:-1]]])) <= tiny)
+    rests = np.append(True, np.abs(np.diff(reference)) <= tiny)
+    again[: np.argmin((again & rests) | (np.arange(len(y)) <= np.argmax(known)))] = False
+    return again
+
+
+def _correlated(
+    name: str, correlation: float, left: np.ndarray, used: np.ndarray, bound: float, dt: float
+) -> list[str]:
+    """Returns a remark if what is left of a measurement (n,) is correlated where it is used (n,)."""
+    from scipy import stats
+
+    if not bound or abs(correlation) <= max(0.2, stats.norm.isf(CHANCE) / np.sqrt(used.sum())):
+        return []
+    steps = np.abs(np.diff(left))
+    fast = np.nanquantile(steps[used[1:] & used[:-1]], 0.95) / dt
+    return [
+        f"what is left of {name} is correlated from sample to sample ({correlation:.2f}): "
+        f"drift {bound:.3g} rate {fast:.3g} describes it better"
+    ]
 
 
 def _autocorrelation(left: np.ndarray, used: np.ndarray) -> np.ndarray:
@@ -324,10 +331,10 @@ def _quantum(values: np.ndarray, samples: int, tiny: float) -> float:
     return float(gaps.sum() / np.rint(gaps / step).sum())
 
 
-def _repeated(
+def _moves(
     smooth: np.ndarray, left: np.ndarray, sigma: float, quantum: float, tiny: float
-) -> np.ndarray:
-    """Returns the probability (n,) with which a measurement that is not held is that before it.
+) -> tuple[np.ndarray, float]:
+    """Returns where a measurement would seldom be that before it if it is not held, and with which chance.
 
     Args:
         smooth: (n,) reference, bias and drift.
@@ -343,7 +350,11 @@ def _repeated(
         y = np.rint(y / quantum) * quantum if quantum else y
         same[1:] += np.where(np.isnan(np.diff(y)), times, np.abs(np.diff(y)) <= tiny)
     same[0] = times
-    return same / times
+    repeated = same / times
+    moves = repeated < 0.5
+    chance = float(np.mean(repeated[moves])) if moves.any() else 1.0
+    # Where between two steps of a quantum the reference lies is known to about a hundredth.
+    return moves, max(chance, 0.01 if quantum else 0.0)
 
 
 def _held(again: np.ndarray, moves: np.ndarray, chance: float) -> tuple[int, float]:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import product
 from typing import Self
 
@@ -13,6 +12,7 @@ from hyrl_mj.errors import BadInput
 from hyrl_mj.physics.plant import Plant
 from hyrl_mj.policies import Controller, answer, is_memory, memory_at_start
 from hyrl_mj.simulation.noise import NOT_STARTED, Sample, Signal, register_noise
+from hyrl_mj.simulation.passing import Rows
 from hyrl_mj.tasks import Outcome, Task
 
 # Samples by which a plant with inertia is simulated ahead.
@@ -22,7 +22,7 @@ BATCH = 2_048
 
 
 @dataclass
-class Ahead:
+class Ahead(Rows):
     """What k simulations ahead show, and how they could go on.
 
     Attributes:
@@ -36,14 +36,6 @@ class Ahead:
     state: np.ndarray
     answers: np.ndarray
     goes_on: np.ndarray
-
-    def __getitem__(self, rows: np.ndarray | slice) -> Ahead:
-        return Ahead(*(getattr(self, field.name)[rows] for field in fields(self)))
-
-    def put(self, rows: np.ndarray, other: Ahead) -> None:
-        """Takes over other simulations (r,) as those of indices `rows` (r,)."""
-        for field in fields(self):
-            getattr(self, field.name)[rows] = getattr(other, field.name)
 
 
 def memory_of(controller: Controller, now: Sample) -> np.ndarray:
@@ -75,8 +67,10 @@ def each_answer(
     candidates: np.ndarray,
     q: np.ndarray,
     memory: np.ndarray,
-) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Yields a controller's answers to candidates of the noise, to several of them at once.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns a controller's answers to c candidates of the noise: (c, n, m), (c, n) and (c, n, ...).
+
+    These are inputs, modes and memories. It is asked about several candidates at once.
 
     Args:
         task: tells what would be measured under noise.
@@ -84,11 +78,8 @@ def each_answer(
         true: (n, p) measurements without noise.
         candidates: (c, p) noise.
         q, memory: as in `answer_of`, of the n runs.
-
-    Yields:
-        Inputs (k, n, m), modes (k, n) and memories (k, n, ...) for the next k of the candidates.
     """
-    n = len(true)
+    n, parts = len(true), []
     several = max(1_024 // max(n, 1), 1)  # more measurements do not stay in a processor's cache
     for first in range(0, len(candidates), several):
         some = candidates[first : first + several]
@@ -96,8 +87,9 @@ def each_answer(
         measured = task.perturbed(np.tile(true, (len(some), 1)), each)
         at = np.tile(np.arange(n), len(some))
         found = answer_of(controller, measured, q[at], memory[at])
-        u, modes, after = (values.reshape(len(some), n, *values.shape[1:]) for values in found)
-        yield u, modes, after
+        parts.append([values.reshape(len(some), n, *values.shape[1:]) for values in found])
+    u, modes, after = map(np.concatenate, zip(*parts, strict=True))
+    return u, modes, after
 
 
 @register_noise
@@ -125,10 +117,7 @@ class Lookahead(Signal):
     samples: int
     _candidates: np.ndarray
     _kept: Ahead
-
-    def __init__(self, bound: float, shares: np.ndarray):
-        super().__init__(bound, shares)
-        self._copies: Plant | None = None
+    _copies: Plant | None = None
 
     def against(self, task: Task, controller: Controller | None) -> Self:
         if self.farthest > 1 and not task.effort.looks_ahead:
@@ -172,8 +161,8 @@ class Lookahead(Signal):
         running = np.flatnonzero(self.task.outcome(true, unstable) == Outcome.RUNNING)
         q, rows, k = now.q[running], now.rows[running], now.k[running]
         memory = memory_of(self.controller, now)[running]
-        found = each_answer(self.task, self.controller, true[running], self._candidates, q, memory)
-        u, q, memory = map(np.concatenate, zip(*found, strict=True))
+        asked = true[running], self._candidates, q, memory
+        u, q, memory = each_answer(self.task, self.controller, *asked)
         answers, remembers = np.concatenate([u, q[..., None]], axis=2), is_memory(memory[0])
         # Simulate each distinct answer once, and only where the candidates' answers differ. With memory
         # the same answer to two candidates does not make them equal.

@@ -7,8 +7,8 @@ those below and register it where it is defined.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from copy import copy, deepcopy
+from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, Protocol, Self, TypeVar, get_args, runtime_checkable
 
@@ -18,9 +18,9 @@ from hyrl_mj.errors import BadInput, check_bound, unknown
 from hyrl_mj.simulation.checked_noise import (
     check_repeats,
     drawn,
-    is_own,
     limits_of,
     too_large,
+    twin_of,
     within,
 )
 
@@ -35,8 +35,10 @@ NOT_STARTED = -1
 KINDS = ("none", "uniform", "alternating", "adversarial")
 # The kind that is what a task's own sensor does; see `hyrl_mj.simulation.sensors`.
 SENSOR = "sensor"
-# Words that are no kind where noise is named: parts of sensors, and what looks at a whole run.
-RESERVED = ("delay", "hold", "quantum", "log", "attack", "worst")
+# The words of parts of sensors that are not noise which is added to a sample; and of the errors of a log.
+DELAY, HOLD, QUANTUM, LOG = "delay", "hold", "quantum", "log"
+# Words that are no kind where noise is named: these, and what looks at a whole run.
+RESERVED = (DELAY, HOLD, QUANTUM, LOG, "attack", "worst")
 # What follows the last sample of a recorded signal.
 After = Literal["refuse", "hold", "repeat", "none"]
 
@@ -150,6 +152,31 @@ def noise_class(kind: str) -> type[Signal]:
     return _KINDS[kind]
 
 
+def made(
+    kind: str,
+    bound: float,
+    shares: np.ndarray,
+    options: Mapping[str, float],
+    task: Task,
+    controller: Controller | None,
+) -> Signal:
+    """Returns the signal of a kind for one closed loop, with options as its attributes.
+
+    Raises:
+        BadInput: it cannot be used there, or has other bounds than are given.
+    """
+    signal = noise_class(kind)(bound, shares.copy())
+    vars(signal).update(options)
+    signal = signal.against(task, controller)
+    limits, allowed = limits_of(signal), bound * np.abs(shares)
+    if kind != SENSOR and not np.array_equal(limits, allowed):
+        raise BadInput(
+            f"{kind} noise of {bound:g} takes {limits} as its largest magnitudes, and is allowed {allowed}: "
+            "leave its bound and shares as they are given"
+        )
+    return signal
+
+
 def noise_kinds() -> tuple[str, ...]:
     """Returns the registered kinds of noise."""
     return tuple(_KINDS)
@@ -186,7 +213,7 @@ class Alternating(Signal):
         return np.where(now.k % 2 == 0, self.bound, -self.bound)[:, None] * self.shares
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class Recorded(Signal):
     """A recorded noise signal.
 
@@ -223,14 +250,13 @@ class Recorded(Signal):
         shares = np.ones(columns) if self.shares is None else np.asarray(self.shares, dtype=float)
         if shares.shape != (columns,):
             raise BadInput(f"a recorded noise on {columns} columns has shares of {shares.shape}")
-        object.__setattr__(self, "values", values.astype(float, copy=False))
-        object.__setattr__(self, "shares", shares)
+        self.values, self.shares = values.astype(float, copy=False), shares
         bad = ~within(values if single else self.values, self.limits)
         if bad.any():
             k, row, column = np.argwhere(bad)[0]
             raise too_large(self, k, row, column, self.values[k, row, column])
         if single:
-            object.__setattr__(self, "values", np.clip(self.values, -self.limits, self.limits))
+            self.values = np.clip(self.values, -self.limits, self.limits)
 
     def reset(self, n: int, rng: np.random.Generator) -> None:
         if self.values.shape[1] != n:
@@ -287,14 +313,7 @@ class Noise:
         if self.everywhere and self.kind == SENSOR:
             raise BadInput("a sensor tells where it acts: leave all coordinates out")
         shares = np.ones(len(task.noisy)) if self.everywhere else np.array(task.noisy, dtype=float)
-        signal = _KINDS[self.kind](self.bound, shares.copy()).against(task, controller)
-        limits = limits_of(signal)
-        if self.kind != SENSOR and not np.array_equal(limits, self.bound * shares):
-            raise BadInput(
-                f"{self.kind} noise of {self.bound:g} takes {limits} as its largest magnitudes, and "
-                f"is allowed {self.bound * shares}: leave its bound and shares as they are given"
-            )
-        return signal
+        return made(self.kind, self.bound, shares, {}, task, controller)
 
 
 @runtime_checkable
@@ -326,7 +345,7 @@ def signal_for(noise: AnyNoise | None, task: Task, controller: Controller | None
         )
     signal = noise.against(task, controller)
     for one in (signal, *signal.noises):
-        object.__setattr__(one, "_begun", limits_of(one).copy())  # a recorded one is frozen
+        object.__setattr__(one, "_begun", limits_of(one).copy())  # a user's may be frozen
     return signal
 
 
@@ -335,11 +354,8 @@ def try_signal(signal: Signal, task: Task, n: int) -> None:
 
     A closed loop looks at that by itself; in an environment an agent closes the loop.
     """
-    if is_own(signal):
-        return
-    try:
-        twins = [deepcopy(signal, {id(task): task}) for _ in range(2)]
-    except Exception:  # what cannot be copied has no twin
+    twins = [twin for _ in range(2) if (twin := twin_of(signal, task)) is not None]
+    if len(twins) < 2:
         return
     for twin in twins:
         twin.reset(n, np.random.default_rng(0))

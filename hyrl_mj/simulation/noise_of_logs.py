@@ -1,4 +1,4 @@
-"""Which noise sensors have, from a log of what they measured."""
+"""Which noise sensors have, from a log of what they measured, and its errors as noise."""
 
 from __future__ import annotations
 
@@ -6,12 +6,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import nan
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from hyrl_mj.errors import BadInput, counted, unknown
-from hyrl_mj.files.logs import read_log
+from hyrl_mj.files.logs import Log
 from hyrl_mj.simulation.column_noise import LEAST, LONGEST_DELAY, ColumnNoise, column_noise
+from hyrl_mj.simulation.noise import LOG, Noise, Sample, Signal
+from hyrl_mj.simulation.sensors import Sensor
+
+if TYPE_CHECKING:
+    from hyrl_mj.policies import Controller
+    from hyrl_mj.tasks import Task
 
 TIMES = ("t", "time")
 MOST = 20_000_000  # samples with gaps between them, which take 160 MB a column and step
@@ -19,15 +26,21 @@ MOST = 20_000_000  # samples with gaps between them, which take 160 MB a column 
 
 @dataclass(frozen=True)
 class LogNoise:
-    """The noise of a log.
+    """The noise of a log; as noise its errors, measurement minus reference, without delays and held samples.
+
+    Each run begins at a time of the log that is drawn for it, and goes on at its beginning where it ends. The
+    columns of the log are those of the chart with the same names; the others have no noise.
 
     Attributes:
         columns: the noise of each column.
         remarks: sentences about the whole log.
+        kind: what runs under it are called.
     """
 
     columns: tuple[ColumnNoise, ...]
     remarks: tuple[str, ...]
+    kind: str = LOG
+    everywhere: ClassVar[bool] = False
 
     @property
     def worst(self) -> ColumnNoise:
@@ -37,29 +50,78 @@ class LogNoise:
             values = np.abs([getattr(column, name) for column in self.columns])
             return float(np.nanmax(values)) if np.isfinite(values).any() else nan
 
-        return replace(
-            max(self.columns, key=lambda column: (column.uniform, len(column.errors))),
-            name="all",
-            delay=most("delay"),
-            held=int(most("held")),
-            held_rate=most("held_rate"),
-            quantum=most("quantum"),
-            bias=most("bias"),
-            told_bias=most("told_bias"),
-            drift=most("drift"),
-            drift_rate=most("drift_rate"),
-            bound=most("bound"),
-            sigma=most("sigma"),
-        )
+        names = (
+            "delay", "held", "held_rate", "quantum", "bias", "told_bias", "drift", "drift_rate", "bound",
+            "sigma",
+        )  # fmt: skip
+        worst: dict[str, Any] = {name: most(name) for name in names}
+        worst["held"] = int(worst["held"])
+        usual = max(self.columns, key=lambda column: (column.uniform, len(column.errors)))
+        return replace(usual, name="all", **worst)
 
     @property
     def text(self) -> str:
         """The noise of all columns to give to a run."""
         return self.worst.text
 
+    @property
+    def bound(self) -> float:
+        """The largest error of all columns, in the unit of the measurement."""
+        return max(float(np.abs(c.errors).max(initial=0.0)) for c in self.columns)
+
+    def against(self, task: Task, controller: Controller | None) -> Signal:
+        """Returns the signal for one closed loop.
+
+        Raises:
+            BadInput: the log has no column of the chart.
+        """
+        columns = {c.name: c for c in self.columns if len(c.errors) > 1}
+        found = [(i, columns[name]) for i, name in enumerate(task.chart.names) if name in columns]
+        if not found:
+            raise BadInput(
+                f"the log has errors of {', '.join(columns)}, and the chart of {task.name} is "
+                f"({', '.join(task.chart.names)}): rename the columns of the log"
+            )
+        signal = _Windows(task, found, self.bound)
+        task.with_noise(tuple(signal.shares.tolist())).check_noise(signal.bound)
+        return signal
+
+
+class _Windows(Signal):
+    """Windows of the errors of some columns of the measurement, each given with its number."""
+
+    kind = LOG
+    unseeing = True
+
+    def __init__(self, task: Task, columns: list[tuple[int, ColumnNoise]], bound: float):
+        shares = np.zeros(len(task.noisy))
+        for i, column in columns:
+            shares[i] = np.abs(column.errors).max() / (bound or 1.0)
+        super().__init__(bound, shares)
+        self._columns, self._dt = columns, task.dt
+        self._first = max(column.times[0] for _, column in columns)
+        self._time = min(column.times[-1] for _, column in columns) - self._first
+        if self._time <= 0:
+            raise BadInput("the columns of the log have no time in common: give them the same rows")
+
+    def reset(self, n: int, rng: np.random.Generator) -> None:
+        super().reset(n, rng)
+        self._window = np.zeros(n)
+
+    def sample(self, now: Sample) -> np.ndarray:
+        fresh = now.rows[now.k == 0]
+        if len(fresh):
+            self._window[fresh] = self.rng.uniform(0.0, self._time, len(fresh))
+        t = self._first + (self._window[now.rows] + now.k * self._dt) % self._time
+        noise = np.zeros_like(now.measurement)
+        for i, column in self._columns:
+            latest = np.searchsorted(column.times, t, side="right") - 1
+            noise[:, i] = column.errors[latest]
+        return noise
+
 
 def noise_from_log(
-    path: str | Path,
+    path: str | Path | Log,
     *,
     columns: Sequence[str] | None = None,
     dt: float | None = None,
@@ -85,29 +147,22 @@ def noise_from_log(
     """
     factors = dict(scale or {})
     for name, factor in factors.items():
-        if isinstance(factor, bool) or not isinstance(factor, int | float | np.number):
+        number = isinstance(factor, int | float | np.number) and not isinstance(factor, bool)
+        if not number or not 0 < abs(factor) < np.inf:
             raise BadInput(f"{name} cannot be multiplied by {factor!r:.40}: give a factor as 0.001")
-    if bad := [name for name, factor in factors.items() if not 0 < abs(factor) < np.inf]:
-        raise BadInput(
-            f"{bad[0]} cannot be multiplied by {factors[bad[0]]:g}: give a factor as 0.001"
-        )
     if dt is not None and not 0 < dt < np.inf:
         raise BadInput(f"a time of {dt:g} s between rows cannot be used: give one > 0")
     if not 0.5 <= share <= 1:
         raise BadInput(f"a share of {share:g} cannot be used: give one from 0.5 to 1, as 0.999")
-    chosen: list[str] = []
-    clock: list[str] = []
-
-    def pick(header: Sequence[str]) -> list[str]:
-        chosen[:] = _chosen(path, header, columns, at_rest)
-        clock[:] = [name for name in header if name in TIMES][:1]
-        references = [] if at_rest else [f"{name}_ref" for name in chosen]
-        for name in (*turn, *factors):
-            if name not in (*chosen, *references):
-                raise unknown(f"column of {path}", name, [*chosen, *references])
-        return [*clock, *chosen, *references]
-
-    data = read_log(path, pick)
+    log = path if isinstance(path, Log) else Log(path)
+    path = log.path
+    chosen = _chosen(path, log.names, columns, at_rest)
+    clock = [name for name in log.names if name in TIMES][:1]
+    looked_at = [*chosen, *([] if at_rest else [f"{name}_ref" for name in chosen])]
+    for name in (*turn, *factors):
+        if name not in looked_at:
+            raise unknown(f"column of {path}", name, looked_at)
+    data = log.read([*clock, *looked_at])
     rows = len(data[chosen[0]])
     if rows < LEAST:
         raise BadInput(f"{path} has {counted(rows, 'row')} of samples: give at least {LEAST}")
@@ -129,12 +184,12 @@ def noise_from_log(
         whole[place] = values
         return whole
 
-    found = []
+    for name, factor in factors.items():
+        data[name] *= factor
+    t, found = placed(times), []
     for name in chosen:
-        y = data[name] * factors.get(name, 1.0)
-        reference = f"{name}_ref"
-        r = None if at_rest else placed(data[reference] * factors.get(reference, 1.0))
-        found.append(column_noise(name, placed(y), r, placed(times), step, name in turn, share))
+        r = None if at_rest else placed(data[f"{name}_ref"])
+        found.append(column_noise(name, placed(data[name]), r, t, step, name in turn, share))
     if any(column.held or column.delay >= 1 for column in found):
         remarks.append(
             f"delay and held samples are counted in samples of this log, of {step:.3g} s: for a robot with "
@@ -196,3 +251,32 @@ def _clock(
     # A gap only has to be longer than any delay.
     apart = np.clip(samples, 1, LONGEST_DELAY + 1).astype(int)
     return t, np.concatenate([[0], np.cumsum(apart)]), step, remarks
+
+
+# What a text can name.
+NamedNoise = Noise | Sensor | LogNoise
+
+
+def noise_of(task: Task, text: str, bound: float, everywhere: bool = False) -> NamedNoise:
+    """Returns the noise that a text names: a kind, a sum of parts, or "log FILE" with the errors of a log.
+
+    Args:
+        task: whose periodic coordinates are angles in a log.
+        text: the text.
+        bound, everywhere: of a kind of noise; the others tell their own bounds.
+
+    Raises:
+        BadInput: it names none, or its file cannot be used.
+    """
+    word, _, rest = text.strip().partition(" ")
+    noise: NamedNoise
+    if word == LOG and rest:
+        log, chart = Log(path := Path(rest.strip())), task.chart
+        turn = [n for n, turns in zip(chart.names, chart.periodic, strict=True) if turns]
+        turn = [name for name in turn if name in log.names]
+        noise = replace(noise_from_log(log, turn=turn), kind=f"{word} {path.name}")
+    else:
+        noise = Sensor.parse(text) if rest else Noise(text, bound, everywhere)
+    if rest and everywhere:
+        raise BadInput(f"the noise {text!r} tells where it acts: leave all coordinates out")
+    return noise

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
@@ -14,8 +14,25 @@ if TYPE_CHECKING:
     from hyrl_mj.tasks import Task
 
 
+class Rows:
+    """Base of dataclasses of arrays with a row for each of n runs, of other such classes, and of None."""
+
+    def __getitem__(self, rows: np.ndarray | slice) -> Self:
+        fields = vars(self).values()
+        return type(self)(*(None if values is None else values[rows] for values in fields))
+
+    def put(self, rows: np.ndarray, other: Self) -> None:
+        """Takes over other runs (k,) as those of indices `rows` (k,)."""
+        for name, values in vars(self).items():
+            new = getattr(other, name)
+            if isinstance(values, Rows):
+                values.put(rows, new)
+            elif values is not None:
+                values[rows] = new
+
+
 @dataclass(frozen=True)
-class Passing:
+class Passing(Rows):
     """How n runs pass K obstacles, seen in the task's plane.
 
     Attributes:
@@ -28,37 +45,26 @@ class Passing:
     last: np.ndarray
     turned: np.ndarray
 
-    def __getitem__(self, rows: np.ndarray) -> Passing:
-        return Passing(self.first[rows], self.last[rows], self.turned[rows])
+    @staticmethod
+    def begin(task: Task, plant: Plant) -> Passing:
+        """Returns that of n robots that have not moved yet."""
+        first = _bearings(task, plant, np.arange(plant.n))
+        return Passing(first, first.copy(), np.zeros_like(first))
 
-
-class Follower:
-    """Follows the bearings of n robots from all obstacles, during their runs."""
-
-    def __init__(self, task: Task, plant: Plant):
-        self._task, self._plant = task, plant
-        self._geoms = list(task.obstacles.values())
-        self._first = self._bearings(np.arange(plant.n))
-        self._last = self._first.copy()
-        self._turned = np.zeros_like(self._first)
-
-    def _bearings(self, rows: np.ndarray) -> np.ndarray:
-        centres = self._plant.geom_positions(self._geoms)[..., list(self._task.plane)]
-        if len(centres) > 1:  # they move
-            centres = centres[rows]
-        away = self._task.where(self._plant.truth(rows))[:, None] - centres
-        return np.arctan2(away[..., 1], away[..., 0])
-
-    def follow(self, active: np.ndarray) -> None:
+    def follow(self, task: Task, plant: Plant, active: np.ndarray) -> None:
         """Follows the runs `active` (k,) by one sample."""
-        now = self._bearings(active)
-        self._turned[active] += wrapped(now - self._last[active])
-        self._last[active] = now
+        now = _bearings(task, plant, active)
+        self.turned[active] += wrapped(now - self.last[active])
+        self.last[active] = now
 
-    @property
-    def passing(self) -> Passing:
-        """What has been seen so far."""
-        return Passing(self._first, self._last, self._turned)
+
+def _bearings(task: Task, plant: Plant, rows: np.ndarray) -> np.ndarray:
+    """Returns the bearings (k, K) of the robots `rows` (k,) from all obstacles [rad]."""
+    centres = plant.geom_positions(list(task.obstacles.values()))[..., list(task.plane)]
+    if len(centres) > 1:  # they move
+        centres = centres[rows]
+    away = task.where(plant.truth(rows))[:, None] - centres
+    return np.arctan2(away[..., 1], away[..., 0])
 
 
 def windings(a: Passing, b: Passing) -> np.ndarray:

@@ -112,10 +112,8 @@ class Programmes(Signal):
         rows, rule = rows[wishful], rule[wishful]
         if not len(rows):
             return
-        true, candidates = now.measurement[rows], self.rules.candidates
-        before = now.q[rows], memory[rows]
-        answers = each_answer(self.task, self.controller, true, candidates, *before)
-        u, q, _ = map(np.concatenate, zip(*answers, strict=True))
+        asked = now.measurement[rows], self.rules.candidates, now.q[rows], memory[rows]
+        u, q, _ = each_answer(self.task, self.controller, *asked)
         u = self._scaled(u)
         usual_mode = np.where(now.q[rows] == NOT_STARTED, q[0], now.q[rows])
         # A change of the mode counts for more than any change of the inputs.
@@ -129,13 +127,9 @@ class Programmes(Signal):
             RuleKind.STAY: contrary - jumps,
         }
         for number in np.unique(rule):
-            wish, mine = self.rules.all[number].wish, rule == number
-            if isinstance(wish, RuleKind):
-                value = values[wish]
-            else:
-                assert wish is not None
-                column, direction = wish
-                value = direction * u[:, :, column]
+            asked, mine = self.rules.all[number], rule == number
+            column, direction = asked.steer
+            value = values.get(asked.kind, direction * u[:, :, column])
             noise[rows[mine]] = self.rules.candidates[value[:, mine].argmax(axis=0)]
 
     def _observe(

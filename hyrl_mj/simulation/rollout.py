@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
-from copy import deepcopy
 from dataclasses import dataclass, replace
 from itertools import count
 from typing import TYPE_CHECKING
@@ -11,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hyrl_mj.policies import Asked, Controller, memory_at_start
-from hyrl_mj.simulation.checked_noise import check_repeats, drawn, is_own
+from hyrl_mj.simulation.checked_noise import check_repeats, drawn, twin_of
 from hyrl_mj.simulation.noise import (
     NOT_STARTED,
     AnyNoise,
@@ -19,7 +17,7 @@ from hyrl_mj.simulation.noise import (
     Signal,
     signal_for,
 )
-from hyrl_mj.simulation.passing import Follower, Passing
+from hyrl_mj.simulation.passing import Passing
 from hyrl_mj.system.progress import progress_bar
 from hyrl_mj.tasks import Outcome
 
@@ -120,17 +118,13 @@ def closed_loop(
     """
     backward, record, n = settings.backward, settings.record, len(z0)
     limit = np.broadcast_to(task.max_steps if settings.steps is None else settings.steps, n)
-    longest = int(limit.max(initial=0))
     # Where each run takes an environment of its own, the next one begins where one ends.
     most = n if task.abilities.side_by_side is None else task.abilities.side_by_side
     together = n <= most
     plant = settings.plant or task.plant(n)
     plant.set_state(*task.state(z0, settings.rng_of_starts(seed)))
     signal = signal_for(noise, task, controller)
-    twin = None
-    if not is_own(signal):
-        with suppress(Exception):  # what cannot be copied has no twin
-            twin = deepcopy(signal, {id(task): task, id(controller): controller})
+    twin = twin_of(signal, task, controller)
     for one in (signal, twin):
         if one is not None:
             one.reset(n, np.random.default_rng(seed))
@@ -141,20 +135,17 @@ def closed_loop(
     q = np.full(n, NOT_STARTED) if q0 is None else np.asarray(q0, dtype=int).copy()
     outcome = np.full(n, Outcome.RUNNING) if backward else task.outcome(measurement, plant.unstable)
     k, length, first_mode = np.zeros(n, dtype=int), np.zeros(n, dtype=int), q.copy()
-    path = np.empty((longest + 1, n, task.chart.dimension))
-    path[0] = task.chart.near(task.z(measurement), z0)
-    p, m = len(task.noisy), len(task.inputs)
+    p, m, every = len(task.noisy), len(task.inputs), np.arange(n)
     shapes = {"before": (), "q": (), "measured": (p,), "u": (m,), "noise": (p,)}
     kept = {name: _Table(n, shape) for name, shape in shapes.items() if record}
-    every = np.arange(n)
+    firsts = {"path": task.chart.near(task.z(measurement), z0)}
     if record:
-        kept["true"] = _Table(n, measurement.shape[1:])
-        kept["true"].put(k, every, measurement)
-    if record and settings.states:
-        kept["state"] = _Table(n, plant.state.shape[1:])
-        kept["state"].put(k, every, plant.state)
-    follower = Follower(task, plant) if settings.passing else None
-    ticks = range(longest) if together else count()
+        firsts |= {"true": measurement} | ({"state": plant.state} if settings.states else {})
+    for name, values in firsts.items():
+        kept[name] = _Table(n, values.shape[1:])
+        kept[name].put(k, every, values)
+    passing = Passing.begin(task, plant) if settings.passing else None
+    ticks = range(int(limit.max(initial=0))) if together else count()
     for tick in progress_bar(ticks, settings.label, "samples", quiet=settings.quiet):
         active = np.flatnonzero((outcome == Outcome.RUNNING) & (k < limit))[:most]
         if not len(active):
@@ -176,16 +167,16 @@ def closed_loop(
         if len(active):
             now_asked = q[active], measured[on], memory[active]
             u[on], q[active], memory[active] = ask(tick, *now_asked)
-        if len(active):
             (plant.step_backward if backward else plant.step)(u[on], active)
         lost = plant.unstable
         stable = rows[~lost[rows]]  # the others keep the last one before they became unstable
         measurement[stable] = plant.truth(stable)
-        path[now.k + 1, rows] = task.chart.near(task.z(measurement[rows]), path[now.k, rows])
+        path = task.chart.near(task.z(measurement[rows]), kept["path"].values[now.k, rows])
         k[rows] += 1
+        kept["path"].put(k[rows], rows, path)
         length[active] = k[active]
-        if follower is not None:
-            follower.follow(active[~lost[active]])
+        if passing is not None:
+            passing.follow(task, plant, active[~lost[active]])
         if not backward:
             outcome[active] = task.outcome(measurement[active], lost[active])
             over = active[(outcome[active] == Outcome.RUNNING) & (k[active] == limit[active])]
@@ -206,7 +197,6 @@ def closed_loop(
     ask.again()
     plant.end()
     if not together:
-        _stay(path, length)
         for name, table in kept.items():
             if name not in ("u", "noise"):
                 _stay(table.values, length - (name in shapes))
@@ -217,9 +207,8 @@ def closed_loop(
         arrays[name] = table.values[: samples + (name not in shapes or name == "noise")]
     for name in ("before", "q"):  # of runs that were over before they began, none
         arrays[name] = np.nan_to_num(arrays[name], nan=NOT_STARTED).astype(int)
-    passing = None if follower is None else follower.passing
     return Rollout(
-        path[: samples + 1], length, limit, outcome, first_mode, **arrays, passing=passing
+        length=length, limit=limit, outcome=outcome, q0=first_mode, **arrays, passing=passing
     )
 
 

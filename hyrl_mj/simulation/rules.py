@@ -1,4 +1,4 @@
-"""The rules that noise signals of an attack are made of, in one order for every controller."""
+"""The rules that noise signals of an attack are made of, in one order for every controller; its settings."""
 
 from __future__ import annotations
 
@@ -7,17 +7,53 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import product
+from typing import Annotated
 
 import numpy as np
 
 from hyrl_mj.policies import Controller
-from hyrl_mj.simulation.attack_settings import AttackSettings
+from hyrl_mj.ranges import Integer, Number, check_fields
 from hyrl_mj.simulation.lookahead import Lookahead
 from hyrl_mj.tasks import Task
 
 
+@dataclass(frozen=True)
+class AttackSettings:
+    """What an attack tries, in all stages that attack. No preset changes the defaults.
+
+    Attributes:
+        flips: times at which the sign of a signal changes once, spread over the length of a run.
+        period_step: of two neighbouring periods of alternating signals the longer is longer by this share: a
+            resonance with a quality factor of five still answers to the nearer of them.
+        segments: segments of a programme of rules, each of the same time; together as long as a run without
+            noise.
+        population: signals that are tried in a round from each start, after one that won from a start nearby.
+        elites: the best programmes so far, for each start and goal, that new ones are drawn from.
+        explore: share of the segments of new programmes that take any rule instead.
+        focused: open starts, the most dangerous ones, at which levels and switching times are evolved.
+        offspring: signals in a generation of that evolution.
+        pieces: pieces of such a signal, within each of which its level or its period stays.
+        spread: standard deviation of the numbers with which the evolution begins. A level is twice its
+            number, and beyond 1 the end of the bound: about a third of the first levels lie there.
+    """
+
+    flips: Annotated[int, Integer(1, 1_000)] = 8
+    period_step: Annotated[float, Number(0.01, 10)] = 0.2
+    segments: Annotated[int, Integer(1, 1_000)] = 10
+    population: Annotated[int, Integer(1, 1_000)] = 8
+    elites: Annotated[int, Integer(1, 1_000)] = 3
+    explore: Annotated[float, Number(0, 1)] = 0.25
+    focused: Annotated[int, Integer(1, 1_000)] = 16
+    offspring: Annotated[int, Integer(2, 1_000)] = 12
+    pieces: Annotated[int, Integer(1, 100)] = 4
+    spread: Annotated[float, Number(0, 10, above=True)] = 0.5
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+
 class RuleKind(StrEnum):
-    """The kinds of rules; the first five say what the answers of a controller to noise are chosen for."""
+    """The kinds of rules; the first six, `WISHES`, say what a controller's answer to noise is chosen for."""
 
     CONTRARY = "contrary"
     STRAIGHT = "straight"
@@ -34,6 +70,7 @@ class RuleKind(StrEnum):
     AHEAD = "ahead"
 
 
+WISHES = tuple(RuleKind)[:6]
 # With more noisy columns than this, rules of noise act on each of them alone and on all together, since
 # their combinations are too many.
 COMBINED = 3
@@ -46,19 +83,16 @@ class Rule:
     Attributes:
         kind: its kind; the same for both signs and for all columns, periods and times.
         noise: (p,) the noise; zero of a rule that chooses it.
-        wish: what an answer is chosen for: a word, or the column and direction of the input to steer to;
-            None of a rule that does not ask the controller.
         period: number of samples after which the sign has changed twice; 0 where it never changes.
         flip: the sample from which the sign is the other one; 0 where it stays.
-        turns: whether the sign is the other one while the mode is not the first of the run.
+        steer: the column and the direction of the input to steer to.
     """
 
     kind: RuleKind
     noise: np.ndarray
-    wish: RuleKind | tuple[int, int] | None = None
     period: int = 0
     flip: int = 0
-    turns: bool = False
+    steer: tuple[int, int] = (0, 0)
 
 
 class Rules:
@@ -107,24 +141,19 @@ class Rules:
     ):
         self.bound, self.shares = bound, shares
         self.candidates = bound * _directions(shares != 0) * shares
-        none, inputs = np.zeros(len(shares)), len(task.inputs)
-        ends = list(self._ends())
-        first, *others = ends if ends else [none]
-        wishes = [
-            Rule(wish, none, wish)
-            for wish in (RuleKind.CONTRARY, RuleKind.STRAIGHT, RuleKind.REVERSE)
-        ]
-        wishes += [Rule(RuleKind.STEER, none, wish) for wish in product(range(inputs), (1, -1))]
+        none, ends = np.zeros(len(shares)), list(self._ends())
+        wishes = [Rule(kind, none) for kind in WISHES[:3]]
+        directions = product(range(len(task.inputs)), (1, -1))
+        wishes += [Rule(RuleKind.STEER, none, steer=direction) for direction in directions]
         own = []
         if len(controller.modes) > 1:
-            own = [Rule(wish, none, wish) for wish in (RuleKind.JUMP, RuleKind.STAY)]
-            own += [
-                Rule(RuleKind.TURN, sign * noise, turns=True) for noise in ends for sign in (1, -1)
-            ]
-        common = [*wishes, *_simple(first)]
-        for noise in others:
-            common += _simple(noise)
-        common += _timed(first, length or task.max_steps, settings)
+            own = [Rule(kind, none) for kind in (RuleKind.JUMP, RuleKind.STAY)]
+            own += [Rule(RuleKind.TURN, sign * noise) for noise in ends for sign in (1, -1)]
+        common = [*wishes]
+        for noise in ends or [none]:
+            common += [Rule(RuleKind.CONSTANT, sign * noise) for sign in (1, -1)]
+            common.append(Rule(RuleKind.ALTERNATING, noise, period=2))
+        common += _timed((ends or [none])[0], length or task.max_steps, settings)
         self.all = [*common, *own, Rule(RuleKind.NOTHING, none), Rule(RuleKind.AHEAD, none)]
         self.own = np.arange(len(common), len(common) + len(own))
         # An environment cannot be simulated ahead from the middle of an episode.
@@ -136,17 +165,14 @@ class Rules:
         self.common = np.arange(len(common))
         if self.lookahead is not None:  # it is the strongest, and takes longer than the others
             self.common = np.insert(self.common, len(wishes) + 3, self.ahead)
-        held = [
-            number
-            for number, r in enumerate(self.all)
-            if not r.flip and r.kind != RuleKind.PERIODIC
-        ]
+        timed = (RuleKind.FLIP, RuleKind.PERIODIC)
+        held = [number for number, rule in enumerate(self.all) if rule.kind not in timed]
         self.parts = np.array(held[:-1])  # without `ahead`
         self.noise = np.array([rule.noise for rule in self.all])
         self.period = np.array([rule.period for rule in self.all])
         self.flip = np.array([rule.flip for rule in self.all])
-        self.turns = np.array([rule.turns for rule in self.all])
-        self.wishful = np.array([rule.wish is not None for rule in self.all])
+        self.turns = np.array([rule.kind == RuleKind.TURN for rule in self.all])
+        self.wishful = np.array([rule.kind in WISHES for rule in self.all])
 
     def __len__(self) -> int:
         return len(self.all)
@@ -191,12 +217,6 @@ def _timed(noise: np.ndarray, length: int, settings: AttackSettings) -> Iterator
     periods = 3 * ratio ** np.arange(math.ceil(math.log(max(length, 3), ratio)))
     for period in np.unique(np.rint(periods[periods <= length]).astype(int)):
         yield Rule(RuleKind.PERIODIC, noise, period=int(period))
-
-
-def _simple(noise: np.ndarray) -> list[Rule]:
-    """Returns the rules of a noise (p,) of both signs and of alternating ones."""
-    constant = [Rule(RuleKind.CONSTANT, sign * noise) for sign in (1, -1)]
-    return [*constant, Rule(RuleKind.ALTERNATING, noise, period=2)]
 
 
 def _directions(noisy: np.ndarray) -> np.ndarray:

@@ -16,12 +16,17 @@ from typing import TYPE_CHECKING, ClassVar, Self
 import numpy as np
 
 from hyrl_mj.errors import BadInput, check_bound, unknown
-from hyrl_mj.simulation.checked_noise import drawn, limits_of
+from hyrl_mj.simulation.checked_noise import drawn
 from hyrl_mj.simulation.noise import (
+    DELAY,
+    HOLD,
     KINDS,
+    LOG,
+    QUANTUM,
     SENSOR,
     Sample,
     Signal,
+    made,
     noise_class,
     noise_kinds,
     register_noise,
@@ -32,8 +37,6 @@ if TYPE_CHECKING:
     from hyrl_mj.policies import Controller
     from hyrl_mj.tasks import Task
 
-# The words of parts that are not noise which is added to a sample.
-DELAY, HOLD, QUANTUM = "delay", "hold", "quantum"
 # Bounds are rounded up to parts of so many, but for the rounding of sums of floats, which is far below that.
 DECIMALS, ROUNDING = 1e9, 1e-3
 
@@ -124,6 +127,9 @@ class Part:
         value: the bound of noise and the quantum, in the unit of the measurement; the longest delay, or the
             most samples that are held in a row.
         options: other numbers by their names: `sigma`, `rate`, or the shortest delay as `least`.
+
+    Raises:
+        BadInput: a number that cannot be.
     """
 
     word: str
@@ -131,7 +137,17 @@ class Part:
     options: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self._check()
+        value, options = self.value, self.options
+        check_bound(value)
+        if self.word in (DELAY, HOLD) and not (1 <= value <= 1_000 and value == int(value)):
+            raise BadInput(f"{self}: give a whole number of samples from 1 to 1000")
+        if options.get("least", value) > value:
+            raise BadInput(f"{self}: give the shortest delay first")
+        if self.word == HOLD and not 0 < options.get("rate", 1) <= 1:
+            raise BadInput(f"{self}: the rate is the share of samples that are held, in (0, 1]")
+        for name, x in options.items():
+            if name in ("sigma", "rate") and not (math.isfinite(x) and x > 0):
+                raise BadInput(f"{self}: give a {name} > 0")
 
     def __str__(self) -> str:
         value, options = f"{self.value:.12g}", dict(self.options)
@@ -152,7 +168,7 @@ class Part:
             BadInput: it names none, or a number that cannot be.
         """
         word, *rest = text.split() or [""]
-        if word == "log":
+        if word == LOG:
             raise BadInput(
                 f"{text.strip()!r} is no part of a sensor: hyrl-mj noise LOG.csv tells which parts it has"
             )
@@ -182,20 +198,6 @@ class Part:
         except ValueError as error:
             raise BadInput(f"{said} ({error}): write {what}") from None
         return Part(word, value, options)
-
-    def _check(self) -> None:
-        """Raises `BadInput` if a number cannot be."""
-        value, options = self.value, self.options
-        check_bound(value)
-        if self.word in (DELAY, HOLD) and not (1 <= value <= 1_000 and value == int(value)):
-            raise BadInput(f"{self}: give a whole number of samples from 1 to 1000")
-        if options.get("least", value) > value:
-            raise BadInput(f"{self}: give the shortest delay first")
-        if self.word == HOLD and not 0 < options.get("rate", 1) <= 1:
-            raise BadInput(f"{self}: the rate is the share of samples that are held, in (0, 1]")
-        for name, x in options.items():
-            if name in ("sigma", "rate") and not (math.isfinite(x) and x > 0):
-                raise BadInput(f"{self}: give a {name} > 0")
 
 
 # A part that does nothing.
@@ -303,8 +305,7 @@ class Sensor:
             raise BadInput(
                 f"the sensor {self} adds nothing on the chart of {task.name}: give it a bound"
             )
-        shares = tuple((reach / bound).tolist())
-        return task.with_noise(shares).check_noise(bound), shares
+        return bound, tuple((reach / bound).tolist())
 
     def against(self, task: Task, controller: Controller | None) -> Signal:
         """Returns the signal for one closed loop.
@@ -359,16 +360,11 @@ class Sensed(Signal):
         shares, self._reach = self.shares, sensor.reach(task)
         self.bound = float(self._reach[: task.chart.dimension].max())
         self.sensor, self.task = sensor, task
-        self.noises: list[Signal] = []
-        for part in sensor.parts:
-            if part.is_noise:
-                noise = noise_class(part.word)(part.value, shares.copy())
-                vars(noise).update(part.options)
-                self.noises.append(noise.against(task, controller))
-                if not np.array_equal(limits_of(noise), part.value * np.abs(shares)):
-                    raise BadInput(
-                        f"{part.word} noise has other bounds than are given: leave them as they are"
-                    )
+        self.noises = [
+            made(part.word, part.value, shares, part.options, task, controller)
+            for part in sensor.parts
+            if part.is_noise
+        ]
         self._quantum = sensor.part(QUANTUM).value * np.abs(shares)
         delay, hold = sensor.part(DELAY), sensor.part(HOLD)
         self._delays = int(delay.options.get("least", delay.value)), int(delay.value)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from hyrl_mj.policies import Policy, PolicyController
-from hyrl_mj.simulation.passing import Passing, windings
+from hyrl_mj.simulation.passing import Passing, Rows, windings
 from hyrl_mj.simulation.rollout import LoopSettings, Rollout, closed_loop
 from hyrl_mj.tasks import ANY, Outcome, Task
 
@@ -17,7 +17,7 @@ ARRIVING = 0.1
 
 
 @dataclass(frozen=True)
-class WayRuns:
+class WayRuns(Rows):
     """The ways of n runs without noise.
 
     Attributes:
@@ -68,23 +68,6 @@ class WayRuns:
         """Which of the runs show ways: (n,) bool; all stable ones if hardly any arrives."""
         return self.shows if self.arriving else self.stable
 
-    def __getitem__(self, rows: np.ndarray) -> WayRuns:
-        return WayRuns(
-            self.alive[rows],
-            self.arrived[rows],
-            self.shows[rows],
-            self.stable[rows],
-            None if self.direction is None else self.direction[rows],
-            None if self.passing is None else self.passing[rows],
-        )
-
-    def with_rows(self, rows: np.ndarray, other: WayRuns) -> WayRuns:
-        """Returns these runs with others (k,) in the rows (k,)."""
-        at = np.arange(len(self))
-        at[rows] = len(self) + np.arange(len(rows))
-        both: WayRuns = _joined(self, other)
-        return both[at]
-
     def differ(self, other: WayRuns) -> np.ndarray:
         """Returns whether runs go another way than those of another: (n,) bool.
 
@@ -97,13 +80,6 @@ class WayRuns:
         assert self.passing is not None
         assert other.passing is not None
         return np.asarray(windings(self.passing, other.passing).any(axis=1))
-
-
-def _joined(a: Any, b: Any) -> Any:
-    """Returns the rows of two runs, one after the other."""
-    if a is None or isinstance(a, np.ndarray):
-        return None if a is None else np.concatenate([a, b])
-    return type(a)(*(_joined(getattr(a, name), getattr(b, name)) for name in vars(a)))
 
 
 def policy_runs(task: Task, policy: Policy, z0: np.ndarray, **settings: Any) -> Rollout:

@@ -101,7 +101,7 @@ class _Side:
     def move(self, rows: np.ndarray, other: _Side) -> None:
         """Puts others (k,) in the rows (k,)."""
         self.z[rows], self.paths[rows] = other.z, other.paths
-        self.runs = self.runs.with_rows(rows, other.runs)
+        self.runs.put(rows, other.runs)
 
     def __getitem__(self, rows: np.ndarray) -> _Side:
         return _Side(self.z[rows], self.runs[rows], self.paths[rows])
