@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from mujoco import mjtProjection
 
-from hyrl_mj.fields.modes import decoded
+from hyrl_mj.fields.focus import decoded
 from hyrl_mj.physics import mjcf
 from hyrl_mj.sets import Chart
 from hyrl_mj.tasks import Field, FieldTask, Layouts, Scene, length
