@@ -5,7 +5,6 @@ from functools import cached_property
 import numpy as np
 
 from hyrl_mj.physics import mjcf
-from hyrl_mj.sets import Chart
 from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.pillar import PillarTask
 from hyrl_mj.tasks.registry import register
@@ -17,6 +16,7 @@ class Gate(PillarTask):
 
     name = "gate"
     description = "drive past a pillar that swings across the way (PPO)"
+    coordinates, units, largest, periodic = ("x", "y", "phase"), ("m", "m", "rad"), (np.pi,), True
     inputs, input_units = ("lateral_velocity",), ("m/s",)
     noisy = (0.0, 1.0, 0.0)
     max_steps = 65
@@ -34,16 +34,6 @@ class Gate(PillarTask):
     close, on_the_line = 0.3, 1e-6
     observation_low = (-5.0, -4.0, -1.0, -1.0)
     observation_high = (5.0, 4.0, 1.0, 1.0)
-
-    @cached_property
-    def chart(self) -> Chart:  # type: ignore[override]
-        low, high = (*self.arena[0], -np.pi), (*self.arena[1], np.pi)
-        return Chart(("x", "y", "phase"), ("m", "m", "rad"), low, high, (False, False, True))
-
-    @cached_property
-    def set_point(self) -> np.ndarray:
-        """The goal (3,), at phase 0; what phase the pillar has in the end does not matter."""
-        return np.append(mjcf.site_pos(self.model, "set_point")[:2], 0.0)
 
     @cached_property
     def obstacle(self) -> np.ndarray:

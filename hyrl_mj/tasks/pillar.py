@@ -21,6 +21,8 @@ class PillarTask(Task):
     coordinates: tuple[str, ...] = ("x", "y")
     units: tuple[str, ...] = ("m", "m")
     largest: tuple[float, ...] = ()
+    #: whether those after x and y live on a circle
+    periodic: bool = False
     #: how far before a line the robot is on it [m]; kinematic actuators add up an error of 1e-6 in an episode
     on_the_line: float = 0.0
 
@@ -28,7 +30,8 @@ class PillarTask(Task):
     def chart(self) -> Chart:  # type: ignore[override]
         low = (*self.arena[0], *(-value for value in self.largest))
         high = (*self.arena[1], *self.largest)
-        return Chart(self.coordinates, self.units, low, high, (False,) * len(low))
+        periodic = (False, False, *[self.periodic] * len(self.largest))
+        return Chart(self.coordinates, self.units, low, high, periodic)
 
     @cached_property
     def arena(self) -> tuple[np.ndarray, np.ndarray]:

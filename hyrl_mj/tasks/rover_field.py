@@ -6,13 +6,12 @@ import mujoco
 import numpy as np
 
 from hyrl_mj.physics import mjcf
-from hyrl_mj.tasks.field import Field
-from hyrl_mj.tasks.field_robots import FieldRobot
+from hyrl_mj.tasks.field import Field, FieldRobot
 from hyrl_mj.tasks.registry import register
 from hyrl_mj.tasks.rover import heading_of, positions, wheel_rates, wheels_of
 
 
-class RoverOnWheels:
+class RoverOnWheels(FieldRobot):
     """The rover as a robot in fields: its wheels reach the rates that its inputs ask for after a while.
 
     Its pose is that of the middle of its bumper, which is what touches posts.
