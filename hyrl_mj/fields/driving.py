@@ -13,7 +13,7 @@ from mujoco import mjtProjection
 from hyrl_mj.fields.focus import decoded
 from hyrl_mj.physics import mjcf
 from hyrl_mj.sets import Chart
-from hyrl_mj.tasks import Field, FieldTask, Layouts, Scene, length
+from hyrl_mj.tasks import Field, FieldTask, FullState, Layouts, Scene, length
 
 
 @dataclass(frozen=True)
@@ -208,9 +208,7 @@ class Driving(FieldTask):
         number = np.rint(self.robot.sensed(sensors)[:, 4:])
         return np.hstack([measured, number]) if self._several else measured
 
-    def state(
-        self, z: np.ndarray, rng: np.random.Generator | None = None
-    ) -> tuple[np.ndarray, np.ndarray | None]:
+    def state(self, z: np.ndarray, rng: np.random.Generator | None = None) -> FullState:
         number = z[:, 3] if self._several else np.zeros(len(z))
         return self.robot.state(z[:, :3], np.rint(number))
 

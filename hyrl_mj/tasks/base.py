@@ -16,7 +16,7 @@ from hyrl_mj.files.artifacts import digest
 from hyrl_mj.physics import mjcf
 from hyrl_mj.physics.plant import Plant, input_limits
 from hyrl_mj.sets import Chart
-from hyrl_mj.tasks.description import Abilities, Effort, Learning, Mirror, Outcome, Scene
+from hyrl_mj.tasks.description import Abilities, Effort, FullState, Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.guard import guard
 from hyrl_mj.tasks.motion import begins_anew, largest_moves
 from hyrl_mj.tasks.obstacles import (
@@ -220,9 +220,7 @@ class Task(ABC):
         """Whether the task defines `control`, between the policy and the actuators."""
         return type(self).control is not Task.control
 
-    def state(
-        self, z: np.ndarray, rng: np.random.Generator | None = None
-    ) -> tuple[np.ndarray, np.ndarray | None]:
+    def state(self, z: np.ndarray, rng: np.random.Generator | None = None) -> FullState:
         """Returns the full state of chart points (n, d): qpos (n, nq) and qvel (n, nv), None at rest.
 
         By default the chart points are the positions. `rng` draws the coordinates that the chart does not

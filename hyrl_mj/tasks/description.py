@@ -5,6 +5,10 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any
 
+import numpy as np
+
+# Positions qpos (n, nq), and velocities qvel (n, nv), None at rest.
+FullState = tuple[np.ndarray, np.ndarray | None]
 # The searches for the critical set.
 SEARCHES = ("rods", "outcome")
 

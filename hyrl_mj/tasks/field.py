@@ -15,7 +15,7 @@ from hyrl_mj.errors import BadInput
 from hyrl_mj.physics import mjcf
 from hyrl_mj.sets import Chart
 from hyrl_mj.tasks.base import Task
-from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
+from hyrl_mj.tasks.description import FullState, Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.layouts import OF_POST, POSE, Layouts, posts_of
 from hyrl_mj.tasks.obstacles import length, wrapped
 from hyrl_mj.tasks.registry import register
@@ -114,7 +114,7 @@ class FieldRobot:
         """Returns x, y, heading, clock and number of the layout (n, 5) [m, m, rad, s, 1]."""
         return sensors
 
-    def state(self, pose: np.ndarray, number: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    def state(self, pose: np.ndarray, number: np.ndarray) -> FullState:
         """Returns qpos (n, nq) and qvel (n, nv) of robots at rest, None for zero.
 
         Args:
@@ -269,9 +269,7 @@ class Field(FieldTask):
             sense = 1 - 2 * (np.rint(self.robot.sensed(sensors)[:, 4]) % 2)
         return np.hstack([super().measure(sensors), sense[:, None]])
 
-    def state(
-        self, z: np.ndarray, rng: np.random.Generator | None = None
-    ) -> tuple[np.ndarray, np.ndarray | None]:
+    def state(self, z: np.ndarray, rng: np.random.Generator | None = None) -> FullState:
         number = np.full(len(z), len(self.layouts) - 1)
         if rng is not None:  # a post that leaves the robot room to act
             fits = np.maximum(np.searchsorted(self._needs, length(z[:, :2]) - self.body - ROOM), 1)

@@ -5,7 +5,7 @@ from functools import cached_property
 import numpy as np
 
 from hyrl_mj.physics import mjcf
-from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
+from hyrl_mj.tasks.description import FullState, Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.pillar import PillarTask
 from hyrl_mj.tasks.registry import register
 
@@ -58,9 +58,7 @@ class Gate(PillarTask):
         ahead, turning = np.full(len(u), speed), np.full(len(u), rate)
         return np.column_stack([ahead, u[:, 0], swinging, turning])
 
-    def state(
-        self, z: np.ndarray, rng: np.random.Generator | None = None
-    ) -> tuple[np.ndarray, np.ndarray | None]:
+    def state(self, z: np.ndarray, rng: np.random.Generator | None = None) -> FullState:
         return np.column_stack([z[:, :2], self.pillar(z[:, 2]), z[:, 2]]), None
 
     def observation(self, measured: np.ndarray) -> np.ndarray:
