@@ -97,12 +97,12 @@ class Driving(FieldTask):
         low, high = middle - self._half - 6.0, middle + self._half + 6.0
         self.start_low = (*low, -np.pi, *[0.0] * several)
         self.start_high = (*high, np.pi, *[len(layouts) - 1.0] * several)
-        fields = [("field", "", 1.0)] * several
-        names, units, scale = zip(
-            ("x", "m", 1.0), ("y", "m", 1.0), ("heading", "rad", 0.5), *fields, strict=True
-        )
-        periodic = (False, False, True, *[False] * several)
-        self.chart = Chart(names, units, self.start_low, self.start_high, periodic, scale=scale)
+        d = 3 + several
+        self.chart = Chart(
+            ("x", "y", "heading", "field")[:d], ("m", "m", "rad", "")[:d],
+            self.start_low, self.start_high,
+            (False, False, True, False)[:d], scale=(1.0, 1.0, 0.5, 1.0)[:d],
+        )  # fmt: skip
         self.noisy = (*bounds.shares(layouts.posts), *[0.0] * several)
         self.reached = reached
         self.max_steps = max(round(time / self.dt), 1)

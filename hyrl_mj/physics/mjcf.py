@@ -363,28 +363,22 @@ def state_columns(model: mujoco.MjModel) -> np.ndarray | None:
 def _columns_of(model: mujoco.MjModel, sensor: int) -> range | None:
     """Returns the columns of a state that a sensor measures, None if it measures something else."""
     kind, joint = mujoco.mjtSensor(model.sensor_type[sensor]), _measured_joint(model, sensor)
-    # Which entries of the joint they are, the first one and their number.
-    of_position = {
-        mujoco.mjtSensor.mjSENS_JOINTPOS: (0, 1),
-        mujoco.mjtSensor.mjSENS_FRAMEPOS: (0, 3),
-        mujoco.mjtSensor.mjSENS_FRAMEQUAT: (3, 4),
+    # Whether they are velocities, and which entries of the joint they are: the first one and their number.
+    entries = {
+        mujoco.mjtSensor.mjSENS_JOINTPOS: (False, 0, 1),
+        mujoco.mjtSensor.mjSENS_FRAMEPOS: (False, 0, 3),
+        mujoco.mjtSensor.mjSENS_FRAMEQUAT: (False, 3, 4),
+        mujoco.mjtSensor.mjSENS_JOINTVEL: (True, 0, 1),
+        mujoco.mjtSensor.mjSENS_FRAMELINVEL: (True, 0, 3),
+        mujoco.mjtSensor.mjSENS_GYRO: (True, 3, 3),
     }
-    of_velocity = {
-        mujoco.mjtSensor.mjSENS_JOINTVEL: (0, 1),
-        mujoco.mjtSensor.mjSENS_FRAMELINVEL: (0, 3),
-        mujoco.mjtSensor.mjSENS_GYRO: (3, 3),
-    }
+    if joint is None or kind not in entries:
+        return None
+    velocities, first, count = entries[kind]
+    of_joint = model.nq + model.jnt_dofadr[joint] if velocities else model.jnt_qposadr[joint]
     # The state begins with time, qpos and qvel.
-    qpos = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_TIME)
-    if joint is None:
-        return None
-    if kind in of_position:
-        of_joint, (first, count) = qpos + model.jnt_qposadr[joint], of_position[kind]
-    elif kind in of_velocity:
-        of_joint, (first, count) = qpos + model.nq + model.jnt_dofadr[joint], of_velocity[kind]
-    else:
-        return None
-    return range(of_joint + first, of_joint + first + count)
+    start = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_TIME) + of_joint + first
+    return range(start, start + count)
 
 
 def _measured_joint(model: mujoco.MjModel, sensor: int) -> int | None:
