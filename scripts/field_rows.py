@@ -24,9 +24,8 @@ from rich.table import Table
 
 import hyrl_mj
 from hyrl_mj.fields import Bounds, Driving, FocusController
-from hyrl_mj.fields.controller import WithoutMemory
+from hyrl_mj.fields.controller import TangentLaw, WithoutMemory
 from hyrl_mj.fields.guard import Guard
-from hyrl_mj.fields.law import TangentLaw
 from hyrl_mj.judging import Budget, attack
 from hyrl_mj.judging.game import LATE
 from hyrl_mj.policies import Controller, PolicyController

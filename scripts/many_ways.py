@@ -25,7 +25,7 @@ from hyrl_mj.judging.game import Lattice
 from hyrl_mj.simulation import KINDS, WayRuns, way_runs
 from hyrl_mj.system import progress
 from hyrl_mj.tasks import ANY, LEFT, RIGHT, pattern_of
-from hyrl_mj.tasks.posts import PostsTask
+from hyrl_mj.tasks.pillar import PostsTask
 
 
 def confirmed(run: hyrl_mj.Run) -> float:

@@ -11,7 +11,7 @@ from dm_control.mujoco.wrapper import core
 import hyrl_mj
 from hyrl_mj import BadInput, Outcome
 from hyrl_mj.gym_export import BatchedEnv
-from hyrl_mj.physics import compiled, mjcf, mujoco_log
+from hyrl_mj.physics import memory, mjcf, mujoco_log
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.simulation import LoopSettings, closed_loop
 from hyrl_mj.tasks import SPARING, check_task, trial
@@ -117,7 +117,7 @@ MISTAKES = {
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_a_mistake_is_one_sentence(tmp_path, monkeypatch, mistake, caplog):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(compiled, "WRONG_VERSION", compiled.mujoco.__version__)
+    monkeypatch.setattr(memory, "WRONG_VERSION", memory.mujoco.__version__)
     edits, says = MISTAKES[mistake]
     edits = edits if isinstance(edits[0], tuple) else (edits,)
     with pytest.raises(BadInput, match=says) as refused:
@@ -279,13 +279,13 @@ def test_only_a_sparse_jacobian_with_constraints_is_refused(option, joint, wrong
         f'<mujoco><option {option}/><worldbody><body><joint type="slide" {joint}/>'
         '<geom size="1" contype="0"/></body></worldbody></mujoco>'
     )
-    assert bool(mjcf.wrong_physics(model, "4.0.0")) == wrong
-    assert mjcf.wrong_physics(model, "4.0.1") == ""
-    assert mjcf.wrong_physics(model, "3.17.0") == ""
+    assert bool(memory.wrong_physics(model, "4.0.0")) == wrong
+    assert memory.wrong_physics(model, "4.0.1") == ""
+    assert memory.wrong_physics(model, "3.17.0") == ""
 
 
 @pytest.mark.parametrize("name", hyrl_mj.task_names())
 def test_the_robots_of_this_package_have_a_dense_jacobian(name):
     model = hyrl_mj.get_task(name).model
     assert not mjcf.mujoco.mj_isSparse(model)
-    assert mjcf.wrong_physics(model, "4.0.0") == ""
+    assert memory.wrong_physics(model, "4.0.0") == ""

@@ -12,7 +12,7 @@ from gl import needs_gl
 import hyrl_mj
 from hyrl_mj.cli import doctor
 from hyrl_mj.errors import NoRenderer
-from hyrl_mj.physics import compiled
+from hyrl_mj.physics import memory
 
 
 @pytest.fixture
@@ -47,9 +47,9 @@ def test_a_healthy_machine(healthy):
 
 def test_it_names_this_package_and_the_version_of_mujoco_that_is_wrong(healthy, monkeypatch):
     assert doctor.versions()[0][1].split() == ["hyrl-mj", hyrl_mj.__version__]
-    monkeypatch.setattr(compiled, "WRONG_VERSION", compiled.mujoco.__version__)
+    monkeypatch.setattr(memory, "WRONG_VERSION", memory.mujoco.__version__)
     assert "sparse constraint Jacobian" in "\n".join(doctor.report()[0])
-    monkeypatch.setattr(compiled, "WRONG_VERSION", "0.0")
+    monkeypatch.setattr(memory, "WRONG_VERSION", "0.0")
     assert "sparse" not in "\n".join(doctor.report()[0])
 
 

@@ -28,8 +28,8 @@ from hyrl_mj.fields import (
     noise_cautions,
     read_field,
 )
+from hyrl_mj.fields.controller import TangentLaw
 from hyrl_mj.fields.drives import bounds_asked_for, bounds_made_for
-from hyrl_mj.fields.law import TangentLaw
 from hyrl_mj.policies import ObservationPolicy
 from hyrl_mj.simulation import AttackSettings
 from hyrl_mj.tasks import LEFT, RIGHT, wrapped

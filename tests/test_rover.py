@@ -121,7 +121,7 @@ def test_its_start_states_move_at_the_speed_of_its_wheels(rover):
     _, qvel = rover.state(np.array([[0.1, 0.2, 0.3]]), np.random.default_rng(0))
     speed = np.hypot(*qvel[0, :2])
     assert speed == pytest.approx(rover.speed)
-    radius, half, _ = rover.wheels
+    radius, half = rover.wheels.radius, rover.wheels.half
     left, right = qvel[0, 6:]
     assert (left + right) / 2 * radius == pytest.approx(speed)
     assert (right - left) * radius / (2 * half) == pytest.approx(qvel[0, 5])

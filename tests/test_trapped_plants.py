@@ -15,7 +15,7 @@ from hyrl_mj.judging.proof.affine import Unbounded
 from hyrl_mj.judging.proof.assumptions import check_assumptions
 from hyrl_mj.sets import Grid
 from hyrl_mj.tasks import check_task
-from hyrl_mj.tasks.anew import begins_anew
+from hyrl_mj.tasks.motion import begins_anew
 
 # The seeds of robots with every trap once: seed k has the trap number k modulo their number.
 ROUNDS = [range(first, first + len(TRAPS)) for first in range(0, 13 * len(TRAPS), len(TRAPS))]

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from hyrl_mj.errors import NoRenderer
-from hyrl_mj.physics import compiled
+from hyrl_mj.physics import memory
 from hyrl_mj.physics.rendering import GL_CURE
 from hyrl_mj.viz.encoding import video
 
@@ -66,7 +66,7 @@ def report() -> tuple[list[str], bool]:
     healthy = not missing
     if missing:
         lines.append(f"cure: pip install {' '.join(missing)}")
-    if mujoco.__version__ == compiled.WRONG_VERSION:
+    if mujoco.__version__ == memory.WRONG_VERSION:
         lines.append(
             "note: MuJoCo 4.0.0 computes wrong forces with a sparse constraint Jacobian; such models are "
             "refused, and those of this package are dense"

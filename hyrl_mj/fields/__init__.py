@@ -1,6 +1,13 @@
 """Fields: a controller that passes any number of posts, with two policies that were trained on one."""
 
-from hyrl_mj.fields.controller import FocusController, GuardedPolicy, controllers, for_posts
+from hyrl_mj.fields.controller import (
+    FocusController,
+    acting_policy,
+    controllers,
+    exported_controller,
+    for_posts,
+    is_local,
+)
 from hyrl_mj.fields.drives import (
     DriveOptions,
     Drives,
@@ -11,9 +18,8 @@ from hyrl_mj.fields.drives import (
     noise_cautions,
 )
 from hyrl_mj.fields.driving import Bounds, Driving
-from hyrl_mj.fields.files import FieldFile, read_field
-from hyrl_mj.fields.given import acting_policy, exported_controller, is_local
-from hyrl_mj.fields.modes import decoded, encoded
+from hyrl_mj.fields.files import read_field
+from hyrl_mj.fields.focus import decoded, encoded
 from hyrl_mj.fields.survey import cautions, check_passable
 
 __all__ = [
@@ -21,9 +27,7 @@ __all__ = [
     "DriveOptions",
     "Drives",
     "Driving",
-    "FieldFile",
     "FocusController",
-    "GuardedPolicy",
     "acting_policy",
     "cautions",
     "changes",

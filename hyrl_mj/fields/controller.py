@@ -1,28 +1,31 @@
-"""A hybrid controller for fields: a mode is the post in focus, its side, and the sense of turning."""
+"""Controllers for fields: a mode is the post in focus, its side, and the sense of turning."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
+from typing import Any, TypeGuard
 
 import numpy as np
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.fields.driving import Driving
-from hyrl_mj.fields.files import MOST_POSTS
-from hyrl_mj.fields.focus import FocusSettings, choose, turn_sense
+from hyrl_mj.fields.files import MOST_POSTS, read_field
+from hyrl_mj.fields.focus import MODES_OF_POST, choose, decoded, encoded, turn_sense
 from hyrl_mj.fields.guard import Guard
-from hyrl_mj.fields.law import TangentLaw
-from hyrl_mj.fields.modes import MODES_OF_POST, decoded, encoded
 from hyrl_mj.fields.seen import Seen
 from hyrl_mj.policies import (
     Controller,
+    HybridController,
+    MlpPolicy,
     ObservationPolicy,
+    Policy,
     PolicyController,
     check_modes,
 )
-from hyrl_mj.tasks import LEFT, RIGHT, Field, FieldTask, Layouts, only_post, wrapped
+from hyrl_mj.tasks import LEFT, RIGHT, Field, FieldTask, Layouts, Task, only_post, wrapped
 
 
 def way_past(
@@ -95,14 +98,12 @@ class FocusController:
         policies: the policy of each side, trained on `task.local`.
         eps: largest error of a measured coordinate [m] that the guard keeps away from posts for.
         first_side: the side on which the first post in focus is passed; None for the shorter way.
-        settings: when the focus and its side change.
     """
 
     task: Driving
     policies: Mapping[int, ObservationPolicy]
     eps: float
     first_side: int | None = None
-    settings: FocusSettings = FocusSettings()
 
     @cached_property
     def modes(self) -> tuple[int, ...]:
@@ -148,7 +149,7 @@ class FocusController:
         The mode -1 stands for none: the answer begins in the initial mode.
         """
         seen, (focus, side, sense) = Seen(measured), decoded(q)
-        focus, side = choose(seen, focus, side, self.swing, self.guard.margin, self.settings)
+        focus, side = choose(seen, focus, side, self.swing, self.guard.margin)
         if self.first_side is not None:
             side = np.where(q < 0, self.first_side, side)
         turn, sense, observed = way_past(self.task.local, only_post(measured, focus), side, sense)
@@ -191,6 +192,28 @@ class WithoutMemory:
         return self.policy.inputs(self.task.local.observation(view))
 
 
+@dataclass(frozen=True)
+class TangentLaw(ObservationPolicy):
+    """A law without learning: speed cos t and rate of turn 4 t, for the angle t to the way past a post.
+
+    Attributes:
+        task: with one post.
+        side: on which it passes the post.
+    """
+
+    task: Field
+    side: int
+
+    def inputs(self, observation: np.ndarray) -> np.ndarray:
+        """Returns inputs (n, 2) [m/s], [rad/s] for observations (n, 17)."""
+        # Half the sum and half the difference of both sides' ways, each as a cosine and a sine.
+        both, apart = observation[:, 10:12], observation[:, 12:14]
+        way = both + apart if self.side == LEFT else both - apart
+        turn = np.arctan2(way[:, 1], way[:, 0])
+        inputs = np.stack([np.maximum(np.cos(turn), 0.0), 4 * turn], axis=1)
+        return np.clip(inputs, *self.task.input_limits)
+
+
 def for_posts(
     local: Field, policies: Mapping[int, ObservationPolicy], eps: float, posts: int
 ) -> FocusController:
@@ -231,3 +254,52 @@ def controllers(
         "hyrl": FocusController(task, policies, eps),
         "law": FocusController(task, laws, eps),
     }
+
+
+# ---- what any task gives to those who do not know of fields
+
+
+def is_local(task: Task) -> TypeGuard[Field]:
+    """Returns whether policies that are trained on a task can drive through fields of posts."""
+    return isinstance(task, Field)
+
+
+def acting_policy(task: Task, policy: Policy, mode: int, eps: float) -> Policy:
+    """Returns what acts in a mode under noise of a bound, from the policy that was trained for the mode.
+
+    On the task of fields this is the policy with a guard, on others the policy itself.
+
+    Raises:
+        BadInput: the guard needs a network, which the policy is not.
+    """
+    if not is_local(task):
+        return policy
+    if not isinstance(policy, MlpPolicy):
+        raise BadInput(
+            f"the policy of mode {mode} is a {type(policy).__name__}, and {task.name} takes networks: train "
+            f"them with hyrl-mj run {task.name}"
+        )
+    return GuardedPolicy(task, policy, mode, eps)
+
+
+def exported_controller(
+    controller: HybridController, field: Path | None = None
+) -> HybridController | FocusController:
+    """Returns the controller to take away: the hybrid controller of a run, or one for fields.
+
+    Args:
+        controller: of a run.
+        field: the file of a field with as many posts as the controller will see; by default one post.
+
+    Raises:
+        BadInput: the file is none of a field, or the task has no use for one.
+    """
+    task = controller.task
+    if is_local(task):
+        sides: dict[int, Any] = {**controller.policies}  # with guards
+        eps = next(iter(sides.values())).eps
+        posts = 1 if field is None else read_field(field).layouts.posts
+        return for_posts(task, {q: side.policy for q, side in sides.items()}, eps, posts)
+    if field is not None:
+        raise BadInput(f"{task.name} has no field of posts: leave --field out")
+    return controller

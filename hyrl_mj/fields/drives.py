@@ -11,7 +11,7 @@ from hyrl_mj.errors import BadInput, check_bound, check_seed
 from hyrl_mj.fields.controller import controllers
 from hyrl_mj.fields.driving import Bounds, Driving
 from hyrl_mj.fields.files import FieldFile
-from hyrl_mj.fields.modes import decoded
+from hyrl_mj.fields.focus import decoded
 from hyrl_mj.judging import Budget, attack
 from hyrl_mj.policies import MlpPolicy, ObservationPolicy
 from hyrl_mj.simulation import AttackSettings, HybridArc, Noise, simulate_batch

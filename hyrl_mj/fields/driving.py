@@ -10,10 +10,10 @@ import mujoco
 import numpy as np
 from mujoco import mjtProjection
 
-from hyrl_mj.fields.modes import decoded
+from hyrl_mj.fields.focus import decoded
 from hyrl_mj.physics import mjcf
 from hyrl_mj.sets import Chart
-from hyrl_mj.tasks import Field, FieldTask, Layouts, Scene, length
+from hyrl_mj.tasks import Field, FieldTask, FullState, Layouts, Scene, length
 
 
 @dataclass(frozen=True)
@@ -97,12 +97,12 @@ class Driving(FieldTask):
         low, high = middle - self._half - 6.0, middle + self._half + 6.0
         self.start_low = (*low, -np.pi, *[0.0] * several)
         self.start_high = (*high, np.pi, *[len(layouts) - 1.0] * several)
-        fields = [("field", "", 1.0)] * several
-        names, units, scale = zip(
-            ("x", "m", 1.0), ("y", "m", 1.0), ("heading", "rad", 0.5), *fields, strict=True
-        )
-        periodic = (False, False, True, *[False] * several)
-        self.chart = Chart(names, units, self.start_low, self.start_high, periodic, scale=scale)
+        d = 3 + several
+        self.chart = Chart(
+            ("x", "y", "heading", "field")[:d], ("m", "m", "rad", "")[:d],
+            self.start_low, self.start_high,
+            (False, False, True, False)[:d], scale=(1.0, 1.0, 0.5, 1.0)[:d],
+        )  # fmt: skip
         self.noisy = (*bounds.shares(layouts.posts), *[0.0] * several)
         self.reached = reached
         self.max_steps = max(round(time / self.dt), 1)
@@ -208,9 +208,7 @@ class Driving(FieldTask):
         number = np.rint(self.robot.sensed(sensors)[:, 4:])
         return np.hstack([measured, number]) if self._several else measured
 
-    def state(
-        self, z: np.ndarray, rng: np.random.Generator | None = None
-    ) -> tuple[np.ndarray, np.ndarray | None]:
+    def state(self, z: np.ndarray, rng: np.random.Generator | None = None) -> FullState:
         number = z[:, 3] if self._several else np.zeros(len(z))
         return self.robot.state(z[:, :3], np.rint(number))
 

@@ -1,6 +1,7 @@
 """Which post of a field is in focus, and on which side it is passed: the logic state (q, lambda).
 
 The way to the goal bends around the posts that block it. The focus is the post that it bends around first.
+A mode is this state in one number, with the sense of turning.
 """
 
 from __future__ import annotations
@@ -17,25 +18,31 @@ from hyrl_mj.tasks import CLEAR, LEFT, PROJECTED, RIGHT
 ROOM = 0.3
 # A turn about less than this angle has a side of its own [rad].
 TURNED = 2.0
+# Where nothing blocks the way, a post that is this near comes into focus [m].
+NEARBY = 0.7
+# A robot at full speed comes so close to a post, within the next second, before the post takes the focus [m].
+CLOSE = 0.3
+# A post ahead holds a robot back that is nearer to it than the margin of the guard and this [m].
+HOLDING = 0.05
+# The post in focus is passed on its other side if that way is shorter by more than this [m].
+LONGER = 1.0
+# Modes of a post: two sides, with two senses of turning each.
+MODES_OF_POST = 4
 
 
-@dataclass(frozen=True)
-class FocusSettings:
-    """When another post takes the focus, and when the focus is passed on its other side.
+def encoded(focus: np.ndarray, side: np.ndarray, sense: np.ndarray) -> np.ndarray:
+    """Returns the modes (n,) of posts in focus (n,), sides (n,) and senses of turning (n,)."""
+    return MODES_OF_POST * focus + 2 * side + np.where(sense < 0, 1, 0)
 
-    Attributes:
-        nearby: where nothing blocks the way, a post that is this near comes into focus [m].
-        close: a robot at full speed comes so close to a post, within the next second, before the post takes
-            the focus [m].
-        holding: a post ahead holds a robot back that is nearer to it than the margin of the guard and this
-            [m].
-        longer: the post in focus is passed on its other side if that way is shorter by more than this [m].
-    """
 
-    nearby: float = 0.7
-    close: float = 0.3
-    holding: float = 0.05
-    longer: float = 1.0
+def decoded(q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns focus (n,), side (n,) and sense of turning (n,) of modes (n,); -1, -1 and 0 for no mode."""
+    focus = np.floor(q / MODES_OF_POST)
+    rest = q - MODES_OF_POST * focus
+    side = np.floor(rest / 2)
+    none = q < 0
+    side, sense = np.where(none, -1, side), np.where(none, 0, 1 - 2 * (rest - 2 * side))
+    return focus.astype(np.int64), side.astype(np.int64), sense.astype(np.int64)
 
 
 @dataclass(frozen=True)
@@ -105,14 +112,13 @@ def longer_on_the_left(
     return lengths[0] - lengths[1]
 
 
-def first_bend(seen: Seen, focus: np.ndarray, side: np.ndarray, wider: float, saved: float) -> Bend:
+def first_bend(seen: Seen, focus: np.ndarray, side: np.ndarray, wider: float) -> Bend:
     """Returns where ways bend first.
 
     Args:
         seen: what was measured.
         focus, side: (n,) of before, -1 for none.
         wider: by how much the disc of the post in focus is wider than others [m].
-        saved: by how much shorter the way on the other side of that post has to be [m].
     """
     reach = seen.radius + CLEAR + wider * seen.only(focus)
     # Posts without room between them, one after the other, over up to 16 posts.
@@ -143,7 +149,7 @@ def first_bend(seen: Seen, focus: np.ndarray, side: np.ndarray, wider: float, sa
         longer = longer_on_the_left(seen, reach, own, wall, x, y)
         way = np.where(together, best_side, np.where(longer <= 0, LEFT, RIGHT))
         # The post in focus is passed on the other side only if that saves much.
-        held = longer < np.where(side == LEFT, saved, -saved)
+        held = longer < np.where(side == LEFT, LONGER, -LONGER)
         way = np.where(post == focus, np.where(held, LEFT, RIGHT), way)
         if bend == 0:
             # The policies drive straight to the goal where only the wider disc is in the way.
@@ -194,7 +200,6 @@ def choose(
     side: np.ndarray,
     swing: float = 0.0,
     margin: float = 0.0,
-    settings: FocusSettings = FocusSettings(),
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns the posts in focus (n,), and the sides (n,) on which they are passed.
 
@@ -204,23 +209,22 @@ def choose(
         swing: how far two measurements of the same place can be from each other [m]. What decides changes
             by more than that before another decision follows.
         margin: distance from the posts' surfaces at which the guard holds the robot back [m].
-        settings: when the focus and its side change.
     """
     # The difference of two distances changes by twice as much as either.
     nearer = wider = 2 * swing
     own = seen.only(focus)
-    bend = first_bend(seen, focus, side, wider, settings.longer)
+    bend = first_bend(seen, focus, side, wider)
     # Nothing blocks the way: the nearest post.
     room, room_of_known = seen.room, pick(seen.room, own)
     least = room.min(axis=1)
-    other = (focus < 0) | ((least < settings.nearby) & (room_of_known > least + nearer))
+    other = (focus < 0) | ((least < NEARBY) & (room_of_known > least + nearer))
     idle = np.where(other, room.argmin(axis=1), focus)
     idle_side = on_side(seen, seen.only(idle), seen.goal_x, seen.goal_y)
     idle_side = np.where(idle == focus, side, idle_side)
     free = bend.focus < 0
     best, best_side = np.where(free, idle, bend.focus), np.where(free, idle_side, bend.side)
     # What is too close on the way.
-    close_by = least_room(seen, bend.x, bend.y) - settings.close - swing * own
+    close_by = least_room(seen, bend.x, bend.y) - CLOSE - swing * own
     close = close_by.argmin(axis=1)
     # The post in focus keeps it while it matters, unless another one that does is nearer.
     matters = ((bend.around | (close_by < 0)) & own).any(axis=1)
@@ -232,7 +236,7 @@ def choose(
     room_of_best = pick(room, first)
     kept = matters & (room_of_best > room_of_known - nearer)
     # A post that holds the robot back takes the focus, or the robot would stand there for ever.
-    held = (room_of_best < margin + settings.holding) & (room_of_best < room_of_known)
+    held = (room_of_best < margin + HOLDING) & (room_of_best < room_of_known)
     kept = kept & ~(held & (pick(seen.towards, first) > 0))
     return np.where(kept, focus, best), np.where(kept, bend.kept_side, best_side)
 

@@ -11,6 +11,14 @@ import numpy as np
 
 from hyrl_mj.fields.seen import TINY, Seen, cross, dot, norm, pick
 
+# The clearance beyond the margin may shrink by this share of itself in a second [1/s].
+DECAY = 3.0
+# A robot retreats only from a post that is ahead of it or behind it: the cosine of the angle between its axis
+# and the post's direction is at least this. Elsewhere that would not take it away.
+STEEP = 0.5
+# With its face to its way a robot drives ahead with at least this speed [m/s], or turns so [rad/s].
+LEAST = 0.3
+
 
 @dataclass(frozen=True)
 class Guard:
@@ -21,11 +29,6 @@ class Guard:
         eps: largest error of a measured coordinate [m]; the heading's is half as much [rad].
         low, high: limits of the forward speed [m/s].
         rate: greatest rate of turn [rad/s].
-        decay: the clearance beyond the margin may shrink by this share of itself in a second [1/s].
-        steep: a robot retreats only from a post that is ahead of it or behind it: the cosine of the angle
-            between its axis and the post's direction is at least this. Elsewhere that would not take it away.
-        least: with its face to its way a robot drives ahead with at least this speed [m/s], or turns so
-            [rad/s].
     """
 
     body: float
@@ -33,9 +36,6 @@ class Guard:
     low: float
     high: float
     rate: float
-    decay: float = 3.0
-    steep: float = 0.5
-    least: float = 0.3
 
     @property
     def margin(self) -> float:
@@ -57,17 +57,17 @@ class Guard:
             turn: (n,) angle from the heading to the way [rad].
             sense: (n,) sense of turning, 1 or -1.
         """
-        creep = self.least * np.cos(turn)
+        creep = LEAST * np.cos(turn)
         back = creep < 0
         speed = np.minimum(np.maximum(u[:, 0], creep), self._approach(seen))
         speed = np.where(back, 0.0, speed)
         # Along the way, or with the face towards it: one that stands beside its way turns to it.
         going = speed * np.cos(turn) + u[:, 1] * np.sin(turn)
-        least_rate = self.least * np.sin(turn)
+        least_rate = LEAST * np.sin(turn)
         towards = np.where(
             turn < 0, np.minimum(u[:, 1], least_rate), np.maximum(u[:, 1], least_rate)
         )
-        rates = np.where(going < self.least, towards, u[:, 1])
+        rates = np.where(going < LEAST, towards, u[:, 1])
         rates = np.where(back, sense * self.rate, rates)
         least, most, aside = self.bounds(seen)
         bounded = np.minimum(np.maximum(speed, least), most)
@@ -94,26 +94,26 @@ class Guard:
         """Returns the least and the greatest speed (n,) that keep the distance from all posts [m/s].
 
         This is a control barrier function of the distance (Ames et al., "Control barrier functions: theory
-        and applications", ECC 2019): the clearance c of each post may shrink by at most `decay` (c - margin)
+        and applications", ECC 2019): the clearance c of each post may shrink by at most DECAY (c - margin)
         a second. The least speed is greater than the greatest where no speed does that. The third result (n,)
         is the sense in which to turn away from the post that sets the greatest speed: 1 against the clock,
         -1 with it, 0 if it is ahead.
         """
         # The distance shrinks by `towards` for each meter ahead, and by `coming` a second.
         towards = seen.towards
-        allowed = self.decay * np.maximum(seen.room - self.margin, 0.0) - seen.coming
+        allowed = DECAY * np.maximum(seen.room - self.margin, 0.0) - seen.coming
         # The direction of the post is not known better than this [rad].
         astray = np.sqrt(2.0) * self.eps / seen.far + self.eps / 2
         across = np.sqrt(np.maximum(1 - towards * towards, 0.0)) * astray
         ahead, behind, close = towards + across, across - towards, allowed < 0
         most = np.where(ahead > 0, allowed / np.maximum(ahead, 1e-3), np.inf)
-        most = np.where(close & (towards < self.steep), np.maximum(most, 0.0), most)
+        most = np.where(close & (towards < STEEP), np.maximum(most, 0.0), most)
         least = np.where(behind > 0, -allowed / np.maximum(behind, 1e-3), -np.inf)
-        least = np.where(close & (towards > -self.steep), np.minimum(least, 0.0), least)
+        least = np.where(close & (towards > -STEEP), np.minimum(least, 0.0), least)
         first = seen.only(most.argmin(axis=1))
         left = cross(seen.cos, seen.sin, pick(seen.x, first), pick(seen.y, first)) > 0
         aside = np.where(left, -1.0, 1.0)
-        aside = np.where(pick(towards, first) < self.steep, aside, 0.0)
+        aside = np.where(pick(towards, first) < STEEP, aside, 0.0)
         low, high = self.low, self.high
         return (
             np.minimum(np.maximum(least.max(axis=1), low), high),

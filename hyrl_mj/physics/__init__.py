@@ -2,4 +2,4 @@
 
 from hyrl_mj.physics import mjcf
 
-__all__ = ["compiled", "memory", "mjcf", "mujoco_log", "plant", "rendering"]
+__all__ = ["memory", "mjcf", "mujoco_log", "plant", "rendering"]

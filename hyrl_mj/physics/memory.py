@@ -1,11 +1,14 @@
-"""What a model remembers beside positions and velocities, and which sensors tell of the past."""
+"""What a model remembers beside positions and velocities, and why one cannot be simulated as it is meant."""
 
 from __future__ import annotations
 
 import mujoco
 import numpy as np
 
-from hyrl_mj.physics import compiled
+from hyrl_mj.physics import mjcf
+
+# The version of MuJoCo that computes wrong constraint forces where the Jacobian is sparse.
+WRONG_VERSION = "4.0.0"
 
 
 def remembers(model: mujoco.MjModel) -> str:
@@ -33,17 +36,65 @@ def remembers(model: mujoco.MjModel) -> str:
 
 def unusable(model: mujoco.MjModel) -> str:
     """Returns why a model cannot be simulated as it is meant, and the remedy; "" if it can."""
-    return compiled.wrong_physics(model) or compiled.keyed_mocap(model) or late_sensor(model)
+    return wrong_physics(model) or keyed_mocap(model) or late_sensor(model)
+
+
+def wrong_physics(model: mujoco.MjModel, version: str = mujoco.__version__) -> str:
+    """Returns why a version of MuJoCo simulates a model wrongly, and the remedy; "" if it does not.
+
+    MuJoCo 4.0.0 factorises the Hessian of the Newton solver wrongly if the constraint Jacobian is sparse
+    (https://github.com/google-deepmind/mujoco/releases/tag/4.0.1).
+    """
+    newton = model.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON
+    if version != WRONG_VERSION or not (
+        newton and mujoco.mj_isSparse(model) and _constrained(model)
+    ):
+        return ""
+    return (
+        f"MuJoCo 4.0.0 computes wrong constraint forces for {mjcf.model_name(model)}, whose Jacobian is "
+        'sparse: give its MJCF <option jacobian="dense"/>, or install another version of MuJoCo'
+    )
+
+
+def _constrained(model: mujoco.MjModel) -> bool:
+    """Returns whether a model can have constraints: contacts, limits, friction losses or equalities."""
+    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONSTRAINT:
+        return False
+    touching = model.geom_contype.any() and model.geom_conaffinity.any()
+    limited = model.jnt_limited.any() or model.tendon_limited.any()
+    rubbing = model.dof_frictionloss.any() or model.tendon_frictionloss.any()
+    return bool(model.neq or model.npair or touching or limited or rubbing)
+
+
+def keyed_mocap(model: mujoco.MjModel) -> str:
+    """Returns which mocap body the first keyframe places, and the remedy, as a sentence; "" if none.
+
+    Mocap bodies stand where the MJCF puts them, or where the task's `mocap` does.
+    """
+    if not (model.nkey and model.nmocap):
+        return ""
+    placed = mjcf.mocap_frames(model)
+    keyed = np.hstack([model.key_mpos[0].reshape(-1, 3), model.key_mquat[0].reshape(-1, 4)])
+    apart = ~np.isclose(keyed, placed, atol=1e-9).all(axis=1)
+    if not apart.any():
+        return ""
+    i = int(apart.argmax())
+    body = mjcf.names(model, mujoco.mjtObj.mjOBJ_BODY)[int((model.body_mocapid == i).argmax())]
+    return (
+        f"the first keyframe of {mjcf.model_name(model)} places mocap body {body} at "
+        f"{keyed[i, :3].tolist()}, and its pos is {placed[i, :3].tolist()}: give the place as the body's pos "
+        "and quat, or by mocap() of the task"
+    )
 
 
 def late_sensor(model: mujoco.MjModel) -> str:
     """Returns which sensor holds or delays its values, and the remedy, as a sentence; "" if none does."""
-    for i, name in enumerate(compiled.names(model, mujoco.mjtObj.mjOBJ_SENSOR)):
+    for i, name in enumerate(mjcf.names(model, mujoco.mjtObj.mjOBJ_SENSOR)):
         period, delay = float(model.sensor_interval[i].max()), float(model.sensor_delay[i])
         if period > 0 or delay > 0:
             does = f"holds its value for {period:g} s" if period > 0 else f"is {delay:g} s late"
             return (
-                f"sensor {name} of {compiled.model_name(model)} {does}, and the true state is taken from the "
+                f"sensor {name} of {mjcf.model_name(model)} {does}, and the true state is taken from the "
                 "sensors: leave out its interval and delay"
             )
     return ""
@@ -54,7 +105,7 @@ def why_not_direct(model: mujoco.MjModel) -> str:
 
     Without contacts and constraints, nothing is left that changes suddenly from one place to the next.
     """
-    actuators = compiled.names(model, mujoco.mjtObj.mjOBJ_ACTUATOR)
+    actuators = mjcf.names(model, mujoco.mjtObj.mjOBJ_ACTUATOR)
     drives = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
     biases = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)
     for i, name in enumerate(actuators):

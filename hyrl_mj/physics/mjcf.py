@@ -1,16 +1,24 @@
-"""MJCF files: compiles them, and gives all that `compiled` reads from compiled models."""
+"""MJCF files: compiles them, and tells names, geometry, cameras and sensors of compiled models.
 
+So that these are written nowhere else.
+"""
+
+from collections.abc import Callable
 from contextlib import suppress
+from difflib import get_close_matches
 from hashlib import sha256
 from pathlib import Path
 
 import mujoco
+import numpy as np
 
-from hyrl_mj.errors import BadInput, has_controls
+from hyrl_mj.errors import BadInput, has_controls, unknown
 from hyrl_mj.files import trust
 from hyrl_mj.physics import mujoco_log
-from hyrl_mj.physics.compiled import *  # noqa: F403 - task files find it here
 from hyrl_mj.system import limits
+
+# Positions (n, nq) of the joints -> positions (n, k, 3) [m] or poses (n, k, 7) of the mocap bodies.
+Mocap = Callable[[np.ndarray], np.ndarray]
 
 # The models that were compiled, each with the digest of its files at that time.
 _LOADED: dict[tuple[Path, str], mujoco.MjModel] = {}
@@ -111,3 +119,285 @@ def _try(path: Path) -> None:
         raise BadInput(f"MuJoCo cannot compile {path}: {found['problem']}")
     if b"file" not in path.read_bytes():
         trust.remember(path)
+
+
+# ---- what compiled models tell
+
+
+def object_id(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str) -> int:
+    """Returns the id of a named object.
+
+    Raises:
+        BadInput: the model has no such object; the message lists those it has.
+    """
+    index = mujoco.mj_name2id(model, kind, name)
+    if index < 0:
+        label = kind.name.removeprefix("mjOBJ_").lower()
+        raise unknown(f"{label} in model {model_name(model)}", name, names(model, kind))
+    return index
+
+
+def names(model: mujoco.MjModel, kind: mujoco.mjtObj) -> list[str]:
+    """Returns the names of all objects of one kind, in the order of their ids."""
+    count = {
+        mujoco.mjtObj.mjOBJ_ACTUATOR: model.nu,
+        mujoco.mjtObj.mjOBJ_BODY: model.nbody,
+        mujoco.mjtObj.mjOBJ_CAMERA: model.ncam,
+        mujoco.mjtObj.mjOBJ_GEOM: model.ngeom,
+        mujoco.mjtObj.mjOBJ_JOINT: model.njnt,
+        mujoco.mjtObj.mjOBJ_NUMERIC: model.nnumeric,
+        mujoco.mjtObj.mjOBJ_SENSOR: model.nsensor,
+        mujoco.mjtObj.mjOBJ_SITE: model.nsite,
+    }[kind]
+    return [mujoco.mj_id2name(model, kind, i) or f"({i})" for i in range(count)]
+
+
+def camera_of(model: mujoco.MjModel, name: str) -> mujoco.MjvCamera:
+    """Returns a camera of the MJCF.
+
+    Where the MJCF has none of that name, "free" is MuJoCo's free camera, and "overhead" looks from above.
+
+    Raises:
+        BadInput: there is no such camera; the message lists those there are.
+    """
+    camera, own = mujoco.MjvCamera(), names(model, mujoco.mjtObj.mjOBJ_CAMERA)
+    if name in own:
+        camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        camera.fixedcamid = own.index(name)
+        return camera
+    if name not in ("overhead", "free"):
+        known = dict.fromkeys([*own, "overhead", "free"])
+        raise unknown(f"camera in model {model_name(model)}", name, known)
+    mujoco.mjv_defaultFreeCamera(model, camera)
+    if name == "overhead":
+        camera.azimuth, camera.elevation = 90.0, -90.0
+    return camera
+
+
+def rests(model: mujoco.MjModel, camera: mujoco.MjvCamera) -> bool:
+    """Returns whether a camera stays where it is, and does not follow a body."""
+    if camera.type == mujoco.mjtCamera.mjCAMERA_FREE:
+        return True
+    number = camera.fixedcamid
+    fixed = model.cam_mode[number] == mujoco.mjtCamLight.mjCAMLIGHT_FIXED
+    return bool(fixed and model.cam_bodyid[number] == 0)
+
+
+def point_of(model: mujoco.MjModel, name: str) -> tuple[str, int]:
+    """Returns where the place of a site, a body or a geom is in MuJoCo's data: ("site_xpos", 2).
+
+    Where the MJCF has none of the name "tracked", that is the first body that moves.
+
+    Raises:
+        BadInput: nothing has that name; the message lists the names there are.
+    """
+    kinds = {
+        "site_xpos": mujoco.mjtObj.mjOBJ_SITE,
+        "xpos": mujoco.mjtObj.mjOBJ_BODY,
+        "geom_xpos": mujoco.mjtObj.mjOBJ_GEOM,
+    }
+    all_names = {where: names(model, kind) for where, kind in kinds.items()}
+    for where, there in all_names.items():
+        if name in there:
+            return where, there.index(name)
+    if name == "tracked" and model.njnt:
+        return "xpos", int(model.jnt_bodyid[0])
+    named = [n for there in all_names.values() for n in there if not n.startswith("(")]
+    raise unknown(f"site, body or geom in model {model_name(model)}", name, dict.fromkeys(named))
+
+
+def model_name(model: mujoco.MjModel) -> str:
+    """Returns the name that the MJCF gives the model."""
+    return bytes(model.names).split(b"\0", 1)[0].decode()
+
+
+def site_pos(model: mujoco.MjModel, name: str) -> np.ndarray:
+    """Returns the position of a site in its body's frame: (3,) [m]."""
+    return model.site_pos[object_id(model, mujoco.mjtObj.mjOBJ_SITE, name)].copy()
+
+
+def site_size(model: mujoco.MjModel, name: str) -> np.ndarray:
+    """Returns the half sizes of a site: (3,) [m]."""
+    return model.site_size[object_id(model, mujoco.mjtObj.mjOBJ_SITE, name)].copy()
+
+
+def geom_pos(model: mujoco.MjModel, name: str) -> np.ndarray:
+    """Returns the position of a geom in its body's frame: (3,) [m]."""
+    return model.geom_pos[object_id(model, mujoco.mjtObj.mjOBJ_GEOM, name)].copy()
+
+
+def geom_positions(model: mujoco.MjModel, ids: list[int]) -> np.ndarray:
+    """Returns the positions of geoms (k,) in the world, with all joints at their references: (k, 3) [m]."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    return data.geom_xpos[ids].copy()
+
+
+def geoms_move(model: mujoco.MjModel, ids: list[int]) -> bool:
+    """Returns whether one of the geoms (k,) can move: by a joint, or with a mocap body."""
+    bodies = model.geom_bodyid[ids]
+    driven = model.body_mocapid[model.body_rootid[bodies]] >= 0
+    return bool((driven | (model.body_weldid[bodies] != 0)).any())
+
+
+def geom_size(model: mujoco.MjModel, name: str) -> np.ndarray:
+    """Returns the sizes of a geom, for a cylinder (radius, half height, 0): (3,) [m]."""
+    return model.geom_size[object_id(model, mujoco.mjtObj.mjOBJ_GEOM, name)].copy()
+
+
+def obstacles(model: mujoco.MjModel) -> list[str]:
+    """Returns the names of the obstacles: all geoms whose names begin with "obstacle"."""
+    kind = mujoco.mjtObj.mjOBJ_GEOM
+    return [name for name in names(model, kind) if name.startswith("obstacle")]
+
+
+def numeric(model: mujoco.MjModel, name: str, size: int) -> np.ndarray:
+    """Returns the values (size,) of a custom numeric.
+
+    Raises:
+        BadInput: the model has no such numeric, or one of another size.
+    """
+    index = object_id(model, mujoco.mjtObj.mjOBJ_NUMERIC, name)
+    first, count = model.numeric_adr[index], model.numeric_size[index]
+    if count != size:
+        raise BadInput(
+            f"numeric {name} of {model_name(model)} has {count} value(s): give it {size}"
+        )
+    return np.array(model.numeric_data[first : first + size])
+
+
+def mocap_poses(model: mujoco.MjModel, mocap: Mocap, qpos: np.ndarray) -> np.ndarray:
+    """Returns the poses (n, k, 7) of the k mocap bodies at positions qpos (n, nq) of the joints.
+
+    A pose is a position [m] and a quaternion; bodies of which only positions are given keep their
+    orientation.
+
+    Raises:
+        BadInput: a wrong shape, or a value that is not finite.
+    """
+    poses = np.asarray(mocap(qpos), dtype=float)
+    shapes = [(len(qpos), model.nmocap, columns) for columns in (3, 7)]
+    if poses.shape not in shapes:
+        raise BadInput(
+            f"mocap() gives shape {poses.shape}, and {model_name(model)} has {model.nmocap} mocap body(s): "
+            f"give their positions, {shapes[0]}, or their poses, {shapes[1]}"
+        )
+    if not np.isfinite(poses).all():
+        row = int(np.argwhere(~np.isfinite(poses))[0][0])
+        raise BadInput(f"mocap() gives {poses[row].tolist()} at qpos {qpos[row].tolist()}")
+    if poses.shape[2] == 3:
+        turned = np.broadcast_to(mocap_frames(model)[:, 3:], (*poses.shape[:2], 4))
+        poses = np.concatenate([poses, turned], axis=2)
+    return poses
+
+
+def mocap_frames(model: mujoco.MjModel) -> np.ndarray:
+    """Returns the poses (k, 7) that the MJCF gives the mocap bodies."""
+    bodies = np.flatnonzero(model.body_mocapid >= 0)
+    bodies = bodies[np.argsort(model.body_mocapid[bodies])]
+    return np.hstack([model.body_pos[bodies], model.body_quat[bodies]])
+
+
+def place(
+    model: mujoco.MjModel, data: mujoco.MjData, qpos: np.ndarray, mocap: Mocap | None = None
+) -> None:
+    """Puts all bodies where they are at positions qpos (nq,) of the joints."""
+    data.qpos[:] = qpos
+    if model.nmocap and mocap is not None:
+        poses = mocap_poses(model, mocap, np.asarray(qpos, dtype=float)[None])[0]
+        data.mocap_pos[:], data.mocap_quat[:] = poses[:, :3], poses[:, 3:]
+    mujoco.mj_kinematics(model, data)
+
+
+def sample_time(model: mujoco.MjModel) -> float:
+    """Returns the controller's sample time [s]: the custom numeric `sample_time`, else the timestep."""
+    known = names(model, mujoco.mjtObj.mjOBJ_NUMERIC)
+    if "sample_time" not in known:
+        for name in get_close_matches("sample_time", known, cutoff=0.8):
+            raise BadInput(
+                f"the numeric {name} of {model_name(model)} means nothing: the sample time of the controller "
+                "is called sample_time"
+            )
+        return float(model.opt.timestep)
+    return float(numeric(model, "sample_time", 1)[0])
+
+
+def substeps(model: mujoco.MjModel) -> int:
+    """Returns the number of physics steps in a sample of the controller.
+
+    Raises:
+        BadInput: a sample is no whole number of them.
+    """
+    time, step = sample_time(model), float(model.opt.timestep)
+    if abs(time / step - round(time / step)) > 1e-6 or time / step < 0.5:
+        raise BadInput(
+            f"the sample time of {model_name(model)} of {time:g} s is no multiple of the physics step "
+            f"{step:g} s: change one of them"
+        )
+    return round(time / step)
+
+
+def quaternion_columns(model: mujoco.MjModel) -> list[slice]:
+    """Returns the columns of qpos that are quaternions: those of free joints and of balls."""
+    after = {mujoco.mjtJoint.mjJNT_FREE: 3, mujoco.mjtJoint.mjJNT_BALL: 0}
+    firsts = [
+        int(address) + after[mujoco.mjtJoint(kind)]
+        for kind, address in zip(model.jnt_type, model.jnt_qposadr, strict=True)
+        if mujoco.mjtJoint(kind) in after
+    ]
+    return [slice(first, first + 4) for first in firsts]
+
+
+def state_columns(model: mujoco.MjModel) -> np.ndarray | None:
+    """Returns the columns (s,) of a state (mjSTATE_INTEGRATION) that the sensors measure.
+
+    Returns None unless each sensor is unmodified and measures the position or velocity of a joint, or the
+    position, orientation, velocity or rates of turn of a body with a free joint.
+    """
+    if any(v.any() for v in (model.sensor_cutoff, model.sensor_delay, model.sensor_interval)):
+        return None
+    columns = [_columns_of(model, sensor) for sensor in range(model.nsensor)]
+    return None if None in columns else np.array([c for some in columns if some for c in some], int)
+
+
+def _columns_of(model: mujoco.MjModel, sensor: int) -> range | None:
+    """Returns the columns of a state that a sensor measures, None if it measures something else."""
+    kind, joint = mujoco.mjtSensor(model.sensor_type[sensor]), _measured_joint(model, sensor)
+    # Whether they are velocities, and which entries of the joint they are: the first one and their number.
+    entries = {
+        mujoco.mjtSensor.mjSENS_JOINTPOS: (False, 0, 1),
+        mujoco.mjtSensor.mjSENS_FRAMEPOS: (False, 0, 3),
+        mujoco.mjtSensor.mjSENS_FRAMEQUAT: (False, 3, 4),
+        mujoco.mjtSensor.mjSENS_JOINTVEL: (True, 0, 1),
+        mujoco.mjtSensor.mjSENS_FRAMELINVEL: (True, 0, 3),
+        mujoco.mjtSensor.mjSENS_GYRO: (True, 3, 3),
+    }
+    if joint is None or kind not in entries:
+        return None
+    velocities, first, count = entries[kind]
+    of_joint = model.nq + model.jnt_dofadr[joint] if velocities else model.jnt_qposadr[joint]
+    # The state begins with time, qpos and qvel.
+    start = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_TIME) + of_joint + first
+    return range(start, start + count)
+
+
+def _measured_joint(model: mujoco.MjModel, sensor: int) -> int | None:
+    """Returns the joint that a sensor measures, or whose body, if it is free; None without such a joint."""
+    kind, measured = mujoco.mjtObj(model.sensor_objtype[sensor]), int(model.sensor_objid[sensor])
+    if kind == mujoco.mjtObj.mjOBJ_JOINT:
+        return measured
+    body = measured
+    if kind == mujoco.mjtObj.mjOBJ_SITE:
+        body = model.site_bodyid[measured]
+        turned = (model.site_quat[measured] != [1, 0, 0, 0]).any()
+        # All points of a body turn at the same rate.
+        away = model.site_pos[measured].any() and (
+            model.sensor_type[sensor] != mujoco.mjtSensor.mjSENS_GYRO
+        )
+        if turned or away:
+            return None
+    elif kind != mujoco.mjtObj.mjOBJ_XBODY:
+        return None
+    joint = int(model.body_jntadr[body])
+    free = joint >= 0 and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE
+    return joint if free and model.sensor_refid[sensor] < 0 else None

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.physics import compiled, memory, mujoco_log
+from hyrl_mj.physics import memory, mjcf, mujoco_log
 from hyrl_mj.ranges import Integer
 from hyrl_mj.system import cores, forked
 
@@ -32,7 +32,7 @@ class Plant:
         threads: threads of the physics, 0 for all cores. Results do not depend on it.
         measure: computes the measurement from the sensor values; by default the sensor values.
         mocap: computes the poses of the mocap bodies from the positions of the joints, see
-            `compiled.mocap_poses`, at every physics step; by default they stay where the MJCF puts them.
+            `mjcf.mocap_poses`, at every physics step; by default they stay where the MJCF puts them.
         control: inner loop that computes the controls of all actuators from u and the true state, at every
             physics step; they are clipped to each actuator's ctrlrange. `inputs` are then names of MJCF
             numerics that hold the limits of u.
@@ -52,7 +52,7 @@ class Plant:
         *,
         measure: Measure = lambda sensors: sensors,
         control: Control | None = None,
-        mocap: compiled.Mocap | None = None,
+        mocap: mjcf.Mocap | None = None,
         steady: bool = False,
     ):
         if problem := memory.unusable(model):
@@ -66,7 +66,7 @@ class Plant:
         # checked here, and clamping would prevent backward steps.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
-        self.substeps = compiled.substeps(model)
+        self.substeps = mjcf.substeps(model)
         self.low, self.high = input_limits(model, inputs, of_actuators=control is None)
         self._columns = [] if control else actuator_columns(model, inputs)
         limited = model.actuator_ctrllimited.astype(bool)[:, None]
@@ -80,8 +80,8 @@ class Plant:
             self._held[:] = np.clip(held, self._ctrl_low, self._ctrl_high) if clamps else held
         self._unstable = np.zeros(n, dtype=bool)
         # Some sensors are read from the state; MuJoCo has to compute others after each step.
-        self._columns_of_state = compiled.state_columns(self.model)
-        self._quaternions = compiled.quaternion_columns(self.model)
+        self._columns_of_state = mjcf.state_columns(self.model)
+        self._quaternions = mjcf.quaternion_columns(self.model)
         self._stage = mujoco.mjtStage.mjSTAGE_NONE
         if self._columns_of_state is None:
             self._stage = mujoco.mjtStage(int(self.model.sensor_needstage.max()))
@@ -100,7 +100,7 @@ class Plant:
             self._batch = Batch(self.model, self.n, self._threads or cores.count())
         except ValueError as error:
             raise BadInput(
-                f"MuJoCo cannot simulate copies of {compiled.model_name(self.model)} side by side ({error}): "
+                f"MuJoCo cannot simulate copies of {mjcf.model_name(self.model)} side by side ({error}): "
                 "leave that out of its MJCF"
             ) from error
         forked.own(self._batch)
@@ -112,8 +112,7 @@ class Plant:
             self._sensors = self._batch.bind("sensordata")
         if state is not None:
             self._batch.state[:] = state
-            if self._stage != mujoco.mjtStage.mjSTAGE_NONE:
-                self._batch.forward(None, self._stage)
+            self._sense(None)
 
     def __getstate__(self) -> dict[str, Any]:
         of_batch = (
@@ -181,19 +180,18 @@ class Plant:
         self._wake()
         self._batch.state[:] = state
         self._unstable[:] = False
-        if self._stage != mujoco.mjtStage.mjSTAGE_NONE:
-            self._batch.forward(None, self._stage)
+        self._sense(None)
 
     def geom_positions(self, ids: Sequence[int]) -> np.ndarray:
         """Returns the positions of geoms in the world: (n, k, 3) [m], or (1, k, 3) if none of them moves."""
         ids = list(ids)
-        if not compiled.geoms_move(self.model, ids):
-            return compiled.geom_positions(self.model, ids)[None]
+        if not mjcf.geoms_move(self.model, ids):
+            return mjcf.geom_positions(self.model, ids)[None]
         if self._geom_positions is None:  # from now on they are computed after each step
             self._geom_positions = self._batch.bind("geom_xpos")
             if self._stage == mujoco.mjtStage.mjSTAGE_NONE:
                 self._stage = mujoco.mjtStage.mjSTAGE_POS
-            self._batch.forward(None, self._stage)
+            self._sense(None)
         return self._geom_positions[:, ids]
 
     def set_state(
@@ -223,8 +221,7 @@ class Plant:
         self._ctrl[rows] = self._held
         self._unstable[rows] = False
         self._drive(rows)
-        if self._stage != mujoco.mjtStage.mjSTAGE_NONE:
-            self._batch.forward(ids, self._stage)
+        self._sense(ids)
 
     def step(self, u: np.ndarray, ids: np.ndarray | None = None) -> None:
         """Advances the copies `ids` (k,), ascending, all by default, by one sample under inputs u (k, m).
@@ -232,8 +229,7 @@ class Plant:
         Raises:
             BadInput: a wrong shape, a value that is not finite, or one outside the input limits.
         """
-        self._wake()
-        self._sample(self._inputs(u, ids), ids)
+        self._sample(u, ids)
 
     def step_backward(self, u: np.ndarray, ids: np.ndarray | None = None) -> None:
         """Reverses `step`: one sample of x' = -f(x, u), for plants with kinematic actuators only.
@@ -243,11 +239,10 @@ class Plant:
         """
         if not self.invertible:
             raise BadInput(
-                f"the plant {compiled.model_name(self.model)} cannot be run backward: that takes a "
+                f"the plant {mjcf.model_name(self.model)} cannot be run backward: that takes a "
                 "velocity actuator with kv >= 1e6 on every degree of freedom, one to one"
             )
-        self._wake()
-        self._sample(self._inputs(u, ids), ids, sign=-1)
+        self._sample(u, ids, sign=-1)
 
     @property
     def invertible(self) -> bool:
@@ -271,12 +266,10 @@ class Plant:
     def _rows(self, ids: np.ndarray | None) -> np.ndarray:
         return np.arange(self.n) if ids is None else ids
 
-    def _inputs(self, u: np.ndarray, ids: np.ndarray | None) -> np.ndarray:
-        """Returns the inputs (k, m), checked and clipped to their limits."""
-        return checked_inputs(u, self.low, self.high, self._rows(ids), "the MJCF")
-
     def _sample(self, u: np.ndarray, ids: np.ndarray | None, sign: int = 1) -> None:
-        """Advances the copies by one sample under checked inputs; sign -1 reverses all controls."""
+        """Advances the copies by one sample; sign -1 reverses all controls."""
+        self._wake()
+        u = checked_inputs(u, self.low, self.high, self._rows(ids), "the MJCF")
         if self._steady and self._mocap is None:
             self._advance(sign * self._controls(u, ids), ids, self.substeps)
             return
@@ -297,7 +290,7 @@ class Plant:
     def _drive(self, rows: np.ndarray) -> None:
         """Puts the mocap bodies of the copies `rows` (k,) where their joints' positions say."""
         if self._mocap is not None:
-            poses = compiled.mocap_poses(self.model, self._mocap, self._qpos[rows])
+            poses = mjcf.mocap_poses(self.model, self._mocap, self._qpos[rows])
             self._mocap_pos[rows], self._mocap_quat[rows] = poses[..., :3], poses[..., 3:]
 
     def _advance(
@@ -315,17 +308,21 @@ class Plant:
                 bad = np.flatnonzero(~valid.all(axis=1))
                 self._unstable[bad] = True
                 self._batch.state[bad] = self._initial
-                if self._stage != mujoco.mjtStage.mjSTAGE_NONE:
-                    self._batch.forward(bad, self._stage)
+                self._sense(bad)
         if self._mocap is not None:
             self._drive(self._rows(ids))
-            if sense and self._stage != mujoco.mjtStage.mjSTAGE_NONE:
-                self._batch.forward(ids, self._stage)
+            if sense:
+                self._sense(ids)
+
+    def _sense(self, ids: np.ndarray | None) -> None:
+        """Computes what MuJoCo has to compute for sensors of the copies `ids` (k,), None for all."""
+        if self._stage != mujoco.mjtStage.mjSTAGE_NONE:
+            self._batch.forward(ids, self._stage)
 
 
 def actuator_columns(model: mujoco.MjModel, names: Sequence[str]) -> list[int]:
     """Returns the ids of the named actuators, or raises `BadInput` with the names that the model has."""
-    return [compiled.object_id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name) for name in names]
+    return [mjcf.object_id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name) for name in names]
 
 
 def input_limits(
@@ -348,7 +345,7 @@ def input_limits(
                 raise BadInput(f"actuator {name} needs a ctrlrange in the MJCF: its input limits")
         ranges = model.actuator_ctrlrange[columns]
     else:
-        ranges = np.array([compiled.numeric(model, name, 2) for name in inputs])
+        ranges = np.array([mjcf.numeric(model, name, 2) for name in inputs])
     return ranges[:, 0], ranges[:, 1]
 
 

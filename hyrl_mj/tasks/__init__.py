@@ -9,15 +9,25 @@ from pkgutil import iter_modules
 
 from hyrl_mj.tasks.base import Task, at_levels
 from hyrl_mj.tasks.checks import check_task
-from hyrl_mj.tasks.description import SEARCHES, Abilities, Learning, Mirror, Outcome, Scene
-from hyrl_mj.tasks.effort import SPARING, Effort
+from hyrl_mj.tasks.description import (
+    SEARCHES,
+    SPARING,
+    Abilities,
+    Effort,
+    FullState,
+    Learning,
+    Mirror,
+    Outcome,
+    Scene,
+)
 from hyrl_mj.tasks.field import CLEAR, FASTEST, PROJECTED, RADII, TAKEN, Field, FieldTask
 from hyrl_mj.tasks.guard import check_finite, read_only, writes
-from hyrl_mj.tasks.layouts import POSE, Layouts, length, only_post, posts_of
+from hyrl_mj.tasks.layouts import POSE, Layouts, only_post, posts_of
 from hyrl_mj.tasks.obstacles import (
     ANY,
     LEFT,
     RIGHT,
+    length,
     number_of,
     pattern_of,
     sides,
@@ -53,6 +63,7 @@ __all__ = [
     "Effort",
     "Field",
     "FieldTask",
+    "FullState",
     "Layouts",
     "Learning",
     "Mirror",

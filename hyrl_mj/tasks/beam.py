@@ -7,7 +7,7 @@ import numpy as np
 from hyrl_mj.physics import mjcf
 from hyrl_mj.sets import Chart
 from hyrl_mj.tasks.base import Task
-from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
+from hyrl_mj.tasks.description import FullState, Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.flight import Rotors
 from hyrl_mj.tasks.registry import register
 
@@ -82,9 +82,7 @@ class Beam(Task):
         velocity = np.column_stack([np.full(len(u), self.speed), u])
         return self.rotors.thrusts(velocity, qpos, qvel)
 
-    def state(
-        self, z: np.ndarray, rng: np.random.Generator | None = None
-    ) -> tuple[np.ndarray, np.ndarray | None]:
+    def state(self, z: np.ndarray, rng: np.random.Generator | None = None) -> FullState:
         qpos, qvel = np.zeros((len(z), 7)), np.zeros((len(z), 6))
         qpos[:, :3], qpos[:, 3], qvel[:, 0] = z, 1.0, self.speed
         if rng is not None:

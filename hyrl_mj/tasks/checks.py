@@ -1,31 +1,23 @@
 """Checks that a task is complete and consistent, before anything is trained."""
 
 import re
+from operator import attrgetter
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hyrl_mj.errors import BadInput, brief, line_in, unknown
+from hyrl_mj.errors import BadInput, brief, line_in
 from hyrl_mj.physics import memory, mjcf
-from hyrl_mj.ranges import Flag, Integer, Number, Optional, Rule, Several, Text
+from hyrl_mj.ranges import Flag, Integer, Number, OneOf, Optional, Rule, Several, Text
 from hyrl_mj.sets import MOST_DIMENSIONS, Chart
+from hyrl_mj.tasks import trial
 from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.description import SEARCHES, Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.mirrored import try_mirror
-from hyrl_mj.tasks.problem import Problem
-from hyrl_mj.tasks.robot import Robot
-from hyrl_mj.tasks.trial import (
-    try_control,
-    try_extreme,
-    try_inputs,
-    try_methods,
-    try_place,
-    try_random,
-    try_where,
-)
 
 # Number of starts that are tried.
 STARTS = 64
+LONGEST = 3_600  # time that is shown [s]
 # What the values of a task's attributes may be.
 RULES: dict[str, Rule] = {
     "max_steps": Integer(1, 100_000),
@@ -35,8 +27,12 @@ RULES: dict[str, Rule] = {
     "steady_control": Flag(),
     "inputs": Several(Text(), 1, 100),
     "input_units": Several(Text(), 0, 100),
+    "scene.time": Number(0, LONGEST, above=True),
+    "learning.search": OneOf(SEARCHES),
+    "learning.horizon": Number(0, LONGEST, above=True),
+    "learning.cells": Optional(Integer(2, 10**6)),
+    "learning.levels": Optional(Integer(1, 1_000)),
 }
-LONGEST = 3_600  # time that is shown [s]
 # What is computed of a task, so that a method or an attribute of that name means something else.
 COMPUTED = (
     "dt", "measurement_columns", "has_inner_loop", "gives_direction", "kinematic", "chart_is_state",
@@ -81,12 +77,7 @@ def _check_names(task: Task) -> None:
 
 
 def _check_parts(task: Task) -> None:
-    if missing := [
-        name
-        for part in (Task, Problem, Robot)
-        for name in part.__annotations__
-        if not hasattr(task, name)
-    ]:
+    if missing := [name for name in Task.__annotations__ if not hasattr(task, name)]:
         raise BadInput(f"it has no {', '.join(missing)}: add what is missing")
     for name, kind in (("chart", Chart), ("scene", Scene), ("learning", Learning)):
         if not isinstance(value := getattr(task, name), kind):
@@ -94,7 +85,7 @@ def _check_parts(task: Task) -> None:
     if not re.fullmatch(r"\w[\w.-]*", str(task.name)):
         raise BadInput(f"its name is {task.name!r}: give letters, digits and _, as my_robot")
     for name, rule in RULES.items():
-        rule.checked(name, getattr(task, name))
+        rule.checked(name, attrgetter(name)(task))
     chart, d = task.chart, task.chart.dimension
     if d > MOST_DIMENSIONS:
         raise BadInput(
@@ -141,7 +132,6 @@ def _check_scene(task: Task) -> None:
         raise BadInput("scene.starts is empty: name a chart point from which a replay starts")
     for start in (*scene.starts, *scene.policy_starts):
         task.chart.check(start, task.name)
-    Number(0, LONGEST, above=True).checked("scene.time", scene.time)
     names = scene.mode_names
     if not names and not task.gives_direction:  # named after the obstacles
         return
@@ -150,16 +140,10 @@ def _check_scene(task: Task) -> None:
 
 
 def _check_training(task: Task) -> None:
-    learning = task.learning
-    if learning.search not in SEARCHES:
-        raise unknown("search", learning.search, SEARCHES)
-    Number(0, LONGEST, above=True).checked("learning.horizon", learning.horizon)
-    Optional(Integer(2, 10**6)).checked("learning.cells", learning.cells)
-    Optional(Integer(1, 1_000)).checked("learning.levels", learning.levels)
-    most = 1_000
-    if learning.levels is not None and not 2 <= learning.levels ** len(task.inputs) <= most:
+    levels, most = task.learning.levels, 1_000
+    if levels is not None and not 2 <= levels ** len(task.inputs) <= most:
         raise BadInput(
-            f"{learning.levels} levels of each of {len(task.inputs)} input(s) cannot be used: give 2 or "
+            f"{levels} levels of each of {len(task.inputs)} input(s) cannot be used: give 2 or "
             f"more, with at most {most:,} combinations, or none"
         )
     if task.mirror is not None and not isinstance(task.mirror, Mirror):
@@ -256,7 +240,7 @@ def _check_round_trip(
 
 def _check_inverse(task: Task, measurement: np.ndarray) -> None:
     """Raises `BadInput` unless measured(), if there is one, is the inverse of observation()."""
-    if type(task).measured is Problem.measured:
+    if type(task).measured is Task.measured:
         return
     seen = task.observation(measurement)
     again = task.observation(task.measured(seen))
@@ -270,7 +254,7 @@ def _check_inverse(task: Task, measurement: np.ndarray) -> None:
 
 def _check_noise_of_chart(task: Task, measurement: np.ndarray) -> None:
     """Raises `BadInput` unless noise moves chart points by about the shares that `noisy` begins with."""
-    if type(task).z is Problem.z:
+    if type(task).z is Task.z:
         return
     z, step, shares = task.z(measurement), 1e-6, np.array(task.noisy, dtype=float)
     by = sum(
@@ -332,14 +316,14 @@ def _check_mocap(task: Task, qpos: np.ndarray) -> None:
 
 
 def _check_episodes(task: Task) -> None:
-    ends = np.append(try_random(task), try_extreme(task))
-    try_methods(task)
-    try_inputs(task)
-    try_control(task)
+    ends = np.append(trial.try_random(task), trial.try_extreme(task))
+    trial.try_methods(task)
+    trial.try_inputs(task)
+    trial.try_control(task)
     try_mirror(task)
     if not task.gives_direction:
-        try_where(task)
-        try_place(task)
+        trial.try_where(task)
+        trial.try_place(task)
     z = task.starts(STARTS, np.random.default_rng(0))
     arrived = task.arrived(z)
     # Where the end says which runs have arrived, any start may be as near to the set-point as they are.

@@ -15,10 +15,9 @@ from hyrl_mj.errors import BadInput
 from hyrl_mj.physics import mjcf
 from hyrl_mj.sets import Chart
 from hyrl_mj.tasks.base import Task
-from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
-from hyrl_mj.tasks.field_robots import FieldRobot, Unicycle
-from hyrl_mj.tasks.layouts import OF_POST, POSE, Layouts, length, posts_of
-from hyrl_mj.tasks.obstacles import wrapped
+from hyrl_mj.tasks.description import FullState, Learning, Mirror, Outcome, Scene
+from hyrl_mj.tasks.layouts import OF_POST, POSE, Layouts, posts_of
+from hyrl_mj.tasks.obstacles import length, wrapped
 from hyrl_mj.tasks.registry import register
 
 # The radii of posts in training [m], and their greatest speed [m/s].
@@ -97,6 +96,38 @@ def turns_to(angle: np.ndarray, sense: np.ndarray) -> np.ndarray:
     """
     offset = sense * np.pi / 2
     return wrapped(angle - offset) + offset
+
+
+class FieldRobot:
+    """A robot with a heading h, that a forward speed v and a rate of turn w drive.
+
+    This one follows them without inertia, x' = v cos h, y' = v sin h, h' = w; others have methods of their
+    own. The last two joints of a model are a clock [s], and the number of the layout.
+
+    Attributes:
+        hull: the cylinder of the model that touches posts; its middle is where the pose is taken.
+    """
+
+    hull = "hull"
+
+    def sensed(self, sensors: np.ndarray) -> np.ndarray:
+        """Returns x, y, heading, clock and number of the layout (n, 5) [m, m, rad, s, 1]."""
+        return sensors
+
+    def state(self, pose: np.ndarray, number: np.ndarray) -> FullState:
+        """Returns qpos (n, nq) and qvel (n, nv) of robots at rest, None for zero.
+
+        Args:
+            pose: (n, 3) x, y, heading [m, m, rad].
+            number: (n,) of the layout.
+        """
+        return np.column_stack([pose, np.zeros(len(pose)), number]), None
+
+    def control(self, u: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+        """Returns the controls (n, nu) for forward speeds and rates of turn u (n, 2) [m/s, rad/s]."""
+        speed, heading = u[:, 0], qpos[:, 2]
+        ahead = speed * np.cos(heading), speed * np.sin(heading)
+        return np.stack([*ahead, u[:, 1], np.ones(len(u)), np.zeros(len(u))], axis=1)
 
 
 class FieldTask(Task):
@@ -181,7 +212,7 @@ class FieldTask(Task):
 @register
 class Field(FieldTask):
     name = "field"
-    robot = Unicycle()
+    robot = FieldRobot()
     description = "drive to a goal among posts, with policies trained on one (PPO)"
     noisy = (1.0, 1.0, 0.5, *[0.0] * 8)
     max_steps = 300
@@ -238,9 +269,7 @@ class Field(FieldTask):
             sense = 1 - 2 * (np.rint(self.robot.sensed(sensors)[:, 4]) % 2)
         return np.hstack([super().measure(sensors), sense[:, None]])
 
-    def state(
-        self, z: np.ndarray, rng: np.random.Generator | None = None
-    ) -> tuple[np.ndarray, np.ndarray | None]:
+    def state(self, z: np.ndarray, rng: np.random.Generator | None = None) -> FullState:
         number = np.full(len(z), len(self.layouts) - 1)
         if rng is not None:  # a post that leaves the robot room to act
             fits = np.maximum(np.searchsorted(self._needs, length(z[:, :2]) - self.body - ROOM), 1)

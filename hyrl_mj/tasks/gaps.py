@@ -5,7 +5,7 @@ from functools import cached_property
 import numpy as np
 
 from hyrl_mj.tasks.description import Mirror, Scene
-from hyrl_mj.tasks.posts import PostsTask
+from hyrl_mj.tasks.pillar import PostsTask
 from hyrl_mj.tasks.registry import register
 
 

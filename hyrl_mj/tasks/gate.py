@@ -5,8 +5,7 @@ from functools import cached_property
 import numpy as np
 
 from hyrl_mj.physics import mjcf
-from hyrl_mj.sets import Chart
-from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
+from hyrl_mj.tasks.description import FullState, Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.pillar import PillarTask
 from hyrl_mj.tasks.registry import register
 
@@ -17,6 +16,7 @@ class Gate(PillarTask):
 
     name = "gate"
     description = "drive past a pillar that swings across the way (PPO)"
+    coordinates, units, largest, periodic = ("x", "y", "phase"), ("m", "m", "rad"), (np.pi,), True
     inputs, input_units = ("lateral_velocity",), ("m/s",)
     noisy = (0.0, 1.0, 0.0)
     max_steps = 65
@@ -34,16 +34,6 @@ class Gate(PillarTask):
     close, on_the_line = 0.3, 1e-6
     observation_low = (-5.0, -4.0, -1.0, -1.0)
     observation_high = (5.0, 4.0, 1.0, 1.0)
-
-    @cached_property
-    def chart(self) -> Chart:  # type: ignore[override]
-        low, high = (*self.arena[0], -np.pi), (*self.arena[1], np.pi)
-        return Chart(("x", "y", "phase"), ("m", "m", "rad"), low, high, (False, False, True))
-
-    @cached_property
-    def set_point(self) -> np.ndarray:
-        """The goal (3,), at phase 0; what phase the pillar has in the end does not matter."""
-        return np.append(mjcf.site_pos(self.model, "set_point")[:2], 0.0)
 
     @cached_property
     def obstacle(self) -> np.ndarray:
@@ -68,9 +58,7 @@ class Gate(PillarTask):
         ahead, turning = np.full(len(u), speed), np.full(len(u), rate)
         return np.column_stack([ahead, u[:, 0], swinging, turning])
 
-    def state(
-        self, z: np.ndarray, rng: np.random.Generator | None = None
-    ) -> tuple[np.ndarray, np.ndarray | None]:
+    def state(self, z: np.ndarray, rng: np.random.Generator | None = None) -> FullState:
         return np.column_stack([z[:, :2], self.pillar(z[:, 2]), z[:, 2]]), None
 
     def observation(self, measured: np.ndarray) -> np.ndarray:

@@ -68,9 +68,3 @@ def only_post(measured: np.ndarray, post: np.ndarray) -> np.ndarray:
     posts = posts_of(measured)
     own = np.arange(posts.shape[1]) == post[:, None]
     return np.hstack([measured[:, :POSE], np.where(own[:, :, None], posts, 0.0).sum(axis=1)])
-
-
-def length(vector: np.ndarray) -> np.ndarray:
-    """Returns the lengths (...) of vectors (..., 2)."""
-    x, y = vector[..., 0], vector[..., 1]
-    return np.sqrt(x * x + y * y)

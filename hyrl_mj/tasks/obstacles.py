@@ -42,17 +42,17 @@ def touching(model: mujoco.MjModel, data: mujoco.MjData, ids: Sequence[int]) -> 
     from scipy.sparse.csgraph import connected_components  # slow to import
 
     touch = np.zeros((len(ids), len(ids)), dtype=bool)
-    for k, i in combinations(range(len(ids)), 2):
-        touch[i, k] = _touch(model, data, ids[i], ids[k])
+    for i, k in combinations(range(len(ids)), 2):
+        if not mjcf.geoms_move(model, [ids[i], ids[k]]):
+            touch[i, k] = mujoco.mj_geomDistance(model, data, ids[k], ids[i], 1e-3, None) <= 1e-6
     count, group = connected_components(touch, directed=False)
     return [[ids[i] for i in np.flatnonzero(group == k).tolist()] for k in range(count)]
 
 
-def _touch(model: mujoco.MjModel, data: mujoco.MjData, a: int, b: int) -> bool:
-    """Returns whether two geoms that do not move touch each other."""
-    if mjcf.geoms_move(model, [a, b]):
-        return False
-    return bool(mujoco.mj_geomDistance(model, data, a, b, 1e-3, None) <= 1e-6)
+def length(vector: np.ndarray) -> np.ndarray:
+    """Returns the lengths (...) of vectors (..., 2)."""
+    x, y = vector[..., 0], vector[..., 1]
+    return np.sqrt(x * x + y * y)
 
 
 def wrapped(angle: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Tasks in the plane: pass a pillar on its left or on its right, to a goal behind it."""
+"""Tasks in the plane: pass a pillar, or several posts, each on its left or on its right, to a goal behind."""
 
 from abc import abstractmethod
 from functools import cached_property
@@ -8,7 +8,7 @@ import numpy as np
 from hyrl_mj.physics import mjcf
 from hyrl_mj.sets import Chart
 from hyrl_mj.tasks.base import Task
-from hyrl_mj.tasks.description import Outcome
+from hyrl_mj.tasks.description import Learning, Outcome
 
 
 class PillarTask(Task):
@@ -21,6 +21,8 @@ class PillarTask(Task):
     coordinates: tuple[str, ...] = ("x", "y")
     units: tuple[str, ...] = ("m", "m")
     largest: tuple[float, ...] = ()
+    #: whether those after x and y live on a circle
+    periodic: bool = False
     #: how far before a line the robot is on it [m]; kinematic actuators add up an error of 1e-6 in an episode
     on_the_line: float = 0.0
 
@@ -28,7 +30,8 @@ class PillarTask(Task):
     def chart(self) -> Chart:  # type: ignore[override]
         low = (*self.arena[0], *(-value for value in self.largest))
         high = (*self.arena[1], *self.largest)
-        return Chart(self.coordinates, self.units, low, high, (False,) * len(low))
+        periodic = (False, False, *[self.periodic] * len(self.largest))
+        return Chart(self.coordinates, self.units, low, high, periodic)
 
     @cached_property
     def arena(self) -> tuple[np.ndarray, np.ndarray]:
@@ -63,3 +66,50 @@ class PillarTask(Task):
 
     def danger(self, measurement: np.ndarray) -> np.ndarray:
         return -self.clearance(measurement)
+
+
+class PostsTask(PillarTask):
+    """A vehicle, x' = 1 m/s and y' = u, among round posts: the geoms whose names begin with "obstacle"."""
+
+    inputs, input_units = ("lateral_velocity",), ("m/s",)
+    noisy = (False, True)
+    worst_reward, on_the_line = 0.0, 1e-6
+    learning = Learning(levels=5)
+
+    @cached_property
+    def posts(self) -> tuple[np.ndarray, np.ndarray]:
+        """Centres (K, 2) and radii (K,) of the posts [m]."""
+        names = mjcf.obstacles(self.model)
+        centres = np.array([mjcf.geom_pos(self.model, name)[:2] for name in names])
+        return centres, np.array([mjcf.geom_size(self.model, name)[0] for name in names])
+
+    @cached_property
+    def observation_low(self) -> tuple[float, ...]:  # type: ignore[override]
+        return tuple(2 * self.arena[0] - self.arena[1])
+
+    @cached_property
+    def observation_high(self) -> tuple[float, ...]:  # type: ignore[override]
+        return tuple(2 * self.arena[1] - self.arena[0])
+
+    def clearance(self, measured: np.ndarray) -> np.ndarray:
+        """Returns the distance to the nearest post: (n,) [m]; negative inside."""
+        centres, radii = self.posts
+        away = measured[:, None, :2] - centres
+        return np.asarray((np.sqrt((away * away).sum(axis=2)) - radii).min(axis=1))
+
+    def observation(self, measured: np.ndarray) -> np.ndarray:
+        return measured
+
+    def measured(self, observation: np.ndarray) -> np.ndarray:
+        return observation
+
+    def reward(self, measurement: np.ndarray, u: np.ndarray) -> np.ndarray:
+        wall = self.arena[1][1] - np.abs(measurement[:, 1])
+        # The last 0.2 m to a post or a wall cost up to 1.
+        near = np.clip(1 - np.minimum(self.clearance(measurement), wall) / 0.2, 0.0, 1.0)
+        # Inputs cost a little, so that turning early costs less than turning late.
+        reward = 1.5 - 0.1 * np.abs(u[:, 0]) - near
+        return np.where(self.failed(measurement), 0.0, reward)
+
+    def miss(self, z: np.ndarray) -> np.ndarray:
+        return np.maximum(self.set_point[0] - z[:, 0], 0.0)  # the goal is a line

@@ -5,7 +5,7 @@ from functools import cached_property
 import numpy as np
 
 from hyrl_mj.physics import mjcf
-from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
+from hyrl_mj.tasks.description import FullState, Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.flight import Rotors, rotation
 from hyrl_mj.tasks.pillar import PillarTask
 from hyrl_mj.tasks.registry import register
@@ -60,9 +60,7 @@ class Quadrotor(PillarTask):
         velocity = np.column_stack([np.full(len(u), speed), u[:, 0], climb])
         return self.rotors.thrusts(velocity, qpos, qvel)
 
-    def state(
-        self, z: np.ndarray, rng: np.random.Generator | None = None
-    ) -> tuple[np.ndarray, np.ndarray | None]:
+    def state(self, z: np.ndarray, rng: np.random.Generator | None = None) -> FullState:
         tilt = np.zeros(len(z)) if rng is None else rng.uniform(-1, 1, len(z)) * 0.05
         speed, height = self.cruise
         qpos, qvel = np.zeros((len(z), 7)), np.zeros((len(z), 6))

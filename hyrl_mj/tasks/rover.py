@@ -6,43 +6,46 @@ import mujoco
 import numpy as np
 
 from hyrl_mj.physics import mjcf
-from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
+from hyrl_mj.tasks.description import FullState, Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.flight import rotation
 from hyrl_mj.tasks.pillar import PillarTask
 from hyrl_mj.tasks.registry import register
 
 
-def wheels_of(model: mujoco.MjModel) -> tuple[float, float]:
-    """Returns the radius of a rover's wheel, and half the distance between the two [m]."""
-    radius = float(mjcf.geom_size(model, "left_tyre")[0])
-    return radius, float(model.body("left_wheel").pos[1])
-
-
-def wheel_rates(
-    speed: np.ndarray | float, turn: np.ndarray, radius: float, half: float
-) -> np.ndarray:
-    """Returns rates (n, 2) of the left and the right wheel [rad/s].
+class Wheels:
+    """The two wheels of a rover.
 
     Args:
-        speed: (n,) or one, speed ahead [m/s].
-        turn: (n,) rate of turn [rad/s].
+        model: the compiled model.
+
+    Attributes:
         radius: of a wheel [m].
-        half: half the distance between the two wheels [m].
+        half: half the distance between the two [m].
+        height: of the rover's body [m].
     """
-    return np.stack([speed - turn * half, speed + turn * half], axis=1) / radius
+
+    def __init__(self, model: mujoco.MjModel):
+        self.radius = float(mjcf.geom_size(model, "left_tyre")[0])
+        self.half = float(model.body("left_wheel").pos[1])
+        self.height = float(model.body("rover").pos[2])
+
+    def rates(self, speed: np.ndarray | float, turn: np.ndarray) -> np.ndarray:
+        """Returns rates (n, 2) of both wheels [rad/s] at a speed (n,) or one [m/s] and turns (n,) [rad/s]."""
+        sides = [speed - turn * self.half, speed + turn * self.half]
+        return np.stack(sides, axis=1) / self.radius
+
+    def positions(self, pose: np.ndarray) -> np.ndarray:
+        """Returns positions (n, 9) of all joints for poses x, y, heading (n, 3) [m, m, rad]."""
+        (x, y, heading), nothing = pose.T, np.zeros(len(pose))
+        turned = [np.cos(heading / 2), nothing, nothing, np.sin(heading / 2)]
+        height = np.full(len(pose), self.height)
+        return np.stack([x, y, height, *turned, nothing, nothing], axis=1)
 
 
 def heading_of(attitude: np.ndarray) -> np.ndarray:
     """Returns the headings (n,) [rad] of quaternions (n, 4)."""
     axes = rotation(attitude)
     return np.asarray(np.arctan2(axes[:, 1, 0], axes[:, 0, 0]))
-
-
-def positions(pose: np.ndarray, height: float) -> np.ndarray:
-    """Returns positions (n, 9) of a rover's joints for poses x, y, heading (n, 3) [m, m, rad]."""
-    (x, y, heading), nothing = pose.T, np.zeros(len(pose))
-    turned = [np.cos(heading / 2), nothing, nothing, np.sin(heading / 2)]
-    return np.stack([x, y, np.full(len(pose), height), *turned, nothing, nothing], axis=1)
 
 
 @register
@@ -69,9 +72,9 @@ class Rover(PillarTask):
     observation_high = (5.0, 3.0, np.pi)
 
     @cached_property
-    def wheels(self) -> tuple[float, float, float]:
-        """Radius of a wheel, half the distance between the two [m], speed of the rover [m/s]."""
-        return *wheels_of(self.model), self.speed
+    def wheels(self) -> Wheels:
+        """The wheels that turn and move it."""
+        return Wheels(self.model)
 
     @cached_property
     def speed(self) -> float:
@@ -82,22 +85,15 @@ class Rover(PillarTask):
         return np.column_stack([sensors[:, :2], heading_of(sensors[:, 3:7]), sensors[:, 9]])
 
     def control(self, u: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
-        return self.rates(u[:, 0])
+        return self.wheels.rates(self.speed, u[:, 0])
 
-    def rates(self, turn: np.ndarray) -> np.ndarray:
-        """Returns rates (n, 2) of both wheels [rad/s] that turn the rover at rates (n,) [rad/s]."""
-        radius, half, speed = self.wheels
-        return wheel_rates(speed, turn, radius, half)
-
-    def state(
-        self, z: np.ndarray, rng: np.random.Generator | None = None
-    ) -> tuple[np.ndarray, np.ndarray | None]:
+    def state(self, z: np.ndarray, rng: np.random.Generator | None = None) -> FullState:
         turn = np.zeros(len(z)) if rng is None else rng.uniform(-1, 1, len(z)) * 0.3
         heading, nothing = z[:, 2], np.zeros(len(z))
-        qpos = positions(z, float(self.model.body("rover").pos[2]))
         ahead = [self.speed * np.cos(heading), self.speed * np.sin(heading), nothing]
-        qvel = np.column_stack([*ahead, nothing, nothing, turn, self.rates(turn)])
-        return qpos, qvel
+        rates = self.wheels.rates(self.speed, turn)
+        qvel = np.column_stack([*ahead, nothing, nothing, turn, rates])
+        return self.wheels.positions(z), qvel
 
     def observation(self, measured: np.ndarray) -> np.ndarray:
         ahead = self.obstacle[0] - measured[:, :1]

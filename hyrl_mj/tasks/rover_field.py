@@ -6,13 +6,13 @@ import mujoco
 import numpy as np
 
 from hyrl_mj.physics import mjcf
-from hyrl_mj.tasks.field import Field
-from hyrl_mj.tasks.field_robots import FieldRobot
+from hyrl_mj.tasks.description import FullState
+from hyrl_mj.tasks.field import Field, FieldRobot
 from hyrl_mj.tasks.registry import register
-from hyrl_mj.tasks.rover import heading_of, positions, wheel_rates, wheels_of
+from hyrl_mj.tasks.rover import Wheels, heading_of
 
 
-class RoverOnWheels:
+class RoverOnWheels(FieldRobot):
     """The rover as a robot in fields: its wheels reach the rates that its inputs ask for after a while.
 
     Its pose is that of the middle of its bumper, which is what touches posts.
@@ -24,8 +24,7 @@ class RoverOnWheels:
     hull = "bumper"
 
     def __init__(self, model: mujoco.MjModel):
-        self.radius, self.half = wheels_of(model)
-        self.height = float(model.body("rover").pos[2])
+        self.wheels = Wheels(model)
         # From the middle of the axle ahead to that of the bumper [m].
         self.ahead = float(mjcf.geom_pos(model, self.hull)[0])
 
@@ -34,14 +33,13 @@ class RoverOnWheels:
         middle = sensors[:, :2] + self._ahead(heading)
         return np.column_stack([middle, heading, sensors[:, 7:9]])
 
-    def state(self, pose: np.ndarray, number: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    def state(self, pose: np.ndarray, number: np.ndarray) -> FullState:
         heading = pose[:, 2]
         axle = np.column_stack([pose[:, :2] - self._ahead(heading), heading])
-        return np.column_stack([positions(axle, self.height), np.zeros(len(pose)), number]), None
+        return np.column_stack([self.wheels.positions(axle), np.zeros(len(pose)), number]), None
 
     def control(self, u: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
-        rates = wheel_rates(u[:, 0], u[:, 1], self.radius, self.half)
-        return np.column_stack([rates, np.ones(len(u))])
+        return np.column_stack([self.wheels.rates(u[:, 0], u[:, 1]), np.ones(len(u))])
 
     def _ahead(self, heading: np.ndarray) -> np.ndarray:
         """Returns the ways (n, 2) from the middle of the axle to that of the bumper [m]."""

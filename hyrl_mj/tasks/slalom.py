@@ -1,7 +1,7 @@
 """A slalom: drive past two posts in a row, each on its left or on its right."""
 
 from hyrl_mj.tasks.description import Scene
-from hyrl_mj.tasks.posts import PostsTask
+from hyrl_mj.tasks.pillar import PostsTask
 from hyrl_mj.tasks.registry import register
 
 

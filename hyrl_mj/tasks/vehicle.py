@@ -6,16 +6,9 @@ import numpy as np
 
 from hyrl_mj.physics import mjcf
 from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
+from hyrl_mj.tasks.obstacles import length
 from hyrl_mj.tasks.pillar import PillarTask
 from hyrl_mj.tasks.registry import register
-
-
-def distance(z: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """Returns the distance (n,) of points (n, 2) from one (2,)."""
-    # NumPy's norm takes several times as long.
-    away = z - point
-    x, y = away[..., 0], away[..., 1]
-    return np.asarray(np.sqrt(x * x + y * y))
 
 
 @register
@@ -54,11 +47,11 @@ class Vehicle(PillarTask):
 
     def clearance(self, z: np.ndarray) -> np.ndarray:
         """Returns the distance to the obstacle's surface, d_o: (n,) [m]."""
-        return np.maximum(distance(z, self.obstacle) - self.radius, 0.0)
+        return np.maximum(length(z - self.obstacle) - self.radius, 0.0)
 
     def distance_to_go(self, z: np.ndarray) -> np.ndarray:
         """Returns the distance to the set-point, d_g: (n,) [m]."""
-        return distance(z, self.set_point)
+        return length(z - self.set_point)
 
     def observation(self, measured: np.ndarray) -> np.ndarray:
         seen = np.empty((len(measured), 3))

@@ -2,7 +2,7 @@
 
 from hyrl_mj.tracing.trace import trace
 from hyrl_mj.tracing.traced_array import EVALUATED, Operation, Program, Traced, apply
-from hyrl_mj.tracing.vocabulary import BATCH, ELEMENTWISE, Untraceable
+from hyrl_mj.tracing.vocabulary import BATCH, ELEMENTWISE
 
 __all__ = [
     "BATCH",
@@ -11,7 +11,6 @@ __all__ = [
     "Operation",
     "Program",
     "Traced",
-    "Untraceable",
     "apply",
     "trace",
 ]

@@ -1,4 +1,4 @@
-"""Whether each sample of a plant begins anew: whether positions alone, or the chart, tell what comes."""
+"""How robots move: whether each sample begins anew, and how far it leads."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hyrl_mj.physics import mujoco_log
 from hyrl_mj.tasks.description import Outcome
 
 if TYPE_CHECKING:
-    from hyrl_mj.tasks.problem import Problem
+    from hyrl_mj.tasks.base import Task
 
 # How far a sample may lead beside that of a copy that is made anew, as a share of the longest one. A velocity
 # actuator of strength kv keeps m / (m + h kv) of the velocity of a mass m in a physics step of h seconds:
@@ -18,9 +18,14 @@ if TYPE_CHECKING:
 # sample, of which this is a tenth; and it does not add up, because what lags behind once has caught up later.
 # A proof takes the lag that it measures into account.
 ALIKE = 1e-3
+# Runs side by side, and the samples after which those that do not hold their input draw a new one.
+RUNS, HELD = 512, 8
+# Moves come close to the largest one, and do not reach it: where it depends smoothly on the state, those of
+# thousands of samples fall short of it by less than this share.
+MARGIN = 1e-3
 
 
-def begins_anew(task: Problem, of_chart: bool = False) -> bool:
+def begins_anew(task: Task, of_chart: bool = False) -> bool:
     """Returns whether runs go on as copies do that are made anew at each of their samples.
 
     The runs start all over the chart. A third of them has random inputs, a third random ones of the limits,
@@ -58,7 +63,7 @@ def begins_anew(task: Problem, of_chart: bool = False) -> bool:
     return bool((np.concatenate(off) <= ALIKE * longest + rounding).all())
 
 
-def _inputs(task: Problem, n: int, rng: np.random.Generator) -> np.ndarray:
+def _inputs(task: Task, n: int, rng: np.random.Generator) -> np.ndarray:
     """Returns the inputs (20, n, m) of the runs, sample by sample."""
     low, high = task.input_limits
     shape = (20, n, len(low))
@@ -68,3 +73,30 @@ def _inputs(task: Problem, n: int, rng: np.random.Generator) -> np.ndarray:
     kind = (np.arange(n) % 3)[:, None]
     drawn = rng.uniform(low, high, shape)
     return np.select([kind == 0, kind == 1], [drawn, corners], alternating)
+
+
+def largest_moves(task: Task) -> np.ndarray:
+    """Returns the largest change (p,) of each column of the measurement in one sample, as runs show it.
+
+    They start anywhere on the chart, under inputs at their limits or in their middle, which half of the runs
+    hold. What a collision or an end does is left out.
+    """
+    rng, chart, d = np.random.default_rng(0), task.chart, task.chart.dimension
+    z = chart.draw(4 * RUNS, rng)
+    z = z[task.goes_on(z)][:RUNS]
+    active, largest = np.arange(len(z)), np.zeros(len(task.noisy))
+    plant, (low, high) = task.placed(z, rng), task.input_limits
+    u, changes = np.zeros((len(z), len(low))), active % 2 == 0
+    for k in range(task.max_steps):
+        if k % HELD == 0:
+            drawn = low + (high - low) * rng.integers(3, size=u.shape) / 2
+            u = np.where(changes[:, None] | (k == 0), drawn, u)
+        before = plant.measurement
+        plant.step(u[active], active)
+        after, unstable = plant.measurement, plant.unstable
+        goes_on = task.outcome(after, unstable)[active] == Outcome.RUNNING
+        active = active[goes_on]
+        change = after[active] - before[active]
+        change[:, :d] = chart.difference(after[active, :d], before[active, :d])
+        largest = np.maximum(largest, np.abs(change).max(axis=0, initial=0.0))
+    return (1 + MARGIN) * largest
