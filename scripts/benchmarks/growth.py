@@ -22,7 +22,7 @@ SIZES = {
     "episodes": (1_000, 10_000, 100_000, 1_000_000),
 }
 LABELS = {
-    "simulations": "simulations side by side, 100 samples",
+    "simulations": "simulations side by side, 60 samples",
     "rods": "rods of the first level",
     "episodes": "robustness episodes",
 }
@@ -34,17 +34,11 @@ def measure(kind: str, size: int, run: Path) -> tuple[float, float]:
 
     task = hyrl_mj.get_task("vehicle")
     if kind == "simulations":
-        from hyrl_mj.gym_export import BatchedEnv
+        from benchmarks.engine import episodes
 
-        env = BatchedEnv(task, size)
-        env.seed(0)
-        env.reset()
-        u = np.zeros((size, 1))
+        work = episodes(task, size)
         began = time.perf_counter()
-        for _ in range(100):
-            done = np.flatnonzero(env.step(u).done)
-            if len(done):
-                env.reset(done)
+        work()
     elif kind == "rods":
         policy = hyrl_mj.load_run(run).policy
         began = time.perf_counter()
