@@ -17,11 +17,11 @@ import platform
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from benchmarks import Figure, Measured, control, engine, growth, learning, replay, runs, stages
+from benchmarks import Figure, control, engine, growth, learning, replay, runs, stages
 from rich.console import Console
 from rich.table import Table
 
@@ -48,17 +48,18 @@ def machine() -> str:
     return f"{cpu}, {os.cpu_count()} cores, Python {platform.python_version()}"
 
 
-def table(results: list[Measured]) -> Table:
+def table(results: list[dict[str, Any]]) -> Table:
     """Returns the results as a table."""
     headings = ("figure", "ours", "against", "ratio (least - greatest)", "target")
     printed = Table(*headings, title=machine())
     for r in results:
-        ours = f"{r.ours:.4g} {r.unit}" + (f", {r.memory:.0f} MB" if r.memory else "")
-        other, ratio = "", ""
-        if r.other is not None:
-            other = f"{r.other:.4g} {r.unit}: {r.against}"
-            ratio = f"{np.median(r.ratios):.3g} ({min(r.ratios):.3g} - {max(r.ratios):.3g})"
-        printed.add_row(r.name, ours, other, ratio, r.target)
+        ours = f"{r['ours']:.4g} {r['unit']}"
+        ours += f", {r['memory']:.0f} MB" if r["memory"] else ""
+        other, ratio, ratios = "", "", r["ratios"]
+        if ratios:
+            other = f"{r['other']:.4g} {r['unit']}: {r['against']}"
+            ratio = f"{np.median(ratios):.3g} ({min(ratios):.3g} - {max(ratios):.3g})"
+        printed.add_row(r["name"], ours, other, ratio, r["target"])
     return printed
 
 
@@ -85,7 +86,7 @@ def main() -> None:
             growth.plot(made.path("vehicle"), options.growth)
     Console(width=None if sys.stdout.isatty() else 200).print(table(results))
     if options.json:
-        content = {"machine": machine(), "figures": [asdict(result) for result in results]}
+        content = {"machine": machine(), "figures": results}
         artifacts.write_json(options.json, content, kind="benchmark")
 
 

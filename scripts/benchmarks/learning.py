@@ -8,8 +8,6 @@ from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
-from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
 
 import hyrl_mj
 from benchmarks import Figure
@@ -114,29 +112,18 @@ def _paper(task: Task, quality: Callable[[Task, MlpPolicy], float], enough: floa
             policy_kwargs={"net_arch": list(settings.hidden)},
             **settings.options,
         )
-        judge = _Quality(task, quality, enough)
+        judge, end = _Quality(task, quality, enough), time.perf_counter() + PATIENCE
+
+        def goes_on(*_: object) -> bool:
+            if model.num_timesteps % INTERVAL:
+                return True
+            return time.perf_counter() < end and judge(export(model, task)) < judge.enough
+
         with threads(1):
-            model.learn(settings.samples, callback=_Until(task, judge))
+            model.learn(settings.samples, callback=goes_on)
         if judge(export(model, task)) < judge.enough:
             late = f"{task.name}: SB3 did not reach {enough} in {PATIENCE:.0f} s"
             print(f"{late}: the ratio is greater than this", file=sys.stderr)
         return 1
 
     return work
-
-
-class _Until(BaseCallback):
-    """Ends a training once the policy is good enough, or patience is at its end."""
-
-    def __init__(self, task: Task, judge: _Quality):
-        super().__init__()
-        self._task, self._judge = task, judge
-        self._end = time.perf_counter() + PATIENCE
-
-    def _on_step(self) -> bool:
-        if self.num_timesteps % INTERVAL:
-            return True
-        if time.perf_counter() > self._end:
-            return False
-        model: BaseAlgorithm = self.model
-        return self._judge(export(model, self._task)) < self._judge.enough
