@@ -7,7 +7,7 @@ import io
 import math
 from array import array
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,52 +20,49 @@ NEEDED = "give a CSV file with a line of names and a row for each sample"
 SHOWN = 40  # characters of a cell or a name in a message
 
 
-def read_log(
-    path: str | Path, pick: Callable[[Sequence[str]], Sequence[str]]
-) -> dict[str, np.ndarray]:
-    """Returns columns of a CSV file by their names, each (rows,); NaN where a cell is empty.
+def names_of(path: str | Path) -> list[str]:
+    """Returns the names of the columns of a CSV file; raises `BadInput` as `read_log`."""
+    return _begun(path)[0]
 
-    Args:
-        path: the file.
-        pick: returns the names of the columns to read, given all.
+
+def read_log(path: str | Path, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Returns columns of a CSV file by their names, each (rows,); NaN where a cell is empty.
 
     Raises:
         BadInput: the file cannot be read, or something in it cannot be used.
     """
-    if not isinstance(path, str | Path):
-        raise BadInput(f"{path!r:.60} is no path of a file: {NEEDED}")
-    reader = csv.reader(io.StringIO(_text(Path(path))), strict=True, skipinitialspace=True)
-    try:
-        header = [name.strip() for name in next(reader, [])]
-        _check(path, header)
-        names = pick(header)
-        places = [header.index(name) for name in names]
-        values = [array("d") for _ in names]
-        for row in reader:
-            if not row:
-                continue
-            if len(row) != len(header):
-                raise BadInput(
-                    f"{path}, line {reader.line_num} has {len(row)} cells under {len(header)} names: "
-                    "give each row as many"
-                )
-            for place, column in zip(places, values, strict=True):
-                column.append(_number(row[place], f"{path}, line {reader.line_num}", header[place]))
-    except csv.Error as error:
-        raise BadInput(f"{path} is no CSV file ({brief(error)}): {NEEDED}") from None
+    header, rows = _begun(path)
+    places = [header.index(name) for name in names]
+    values = [array("d") for _ in names]
+    for number, row in rows:
+        if not row:
+            continue
+        if len(row) != len(header):
+            raise BadInput(
+                f"{path}, line {number} has {len(row)} cells under {len(header)} names: give each row as many"
+            )
+        for place, column in zip(places, values, strict=True):
+            column.append(_number(row[place], f"{path}, line {number}", header[place]))
     return {name: np.array(column) for name, column in zip(names, values, strict=True)}
 
 
-def names_of(path: str | Path) -> list[str]:
-    """Returns the names of the columns of a CSV file; raises `BadInput` as `read_log`."""
-    names: list[str] = []
+def _begun(path: str | Path) -> tuple[list[str], Iterator[tuple[int, list[str]]]]:
+    """Returns the names of the columns, and the rows after them with the numbers of their lines."""
+    if not isinstance(path, str | Path):
+        raise BadInput(f"{path!r:.60} is no path of a file: {NEEDED}")
+    rows = _rows(path)
+    header = [name.strip() for name in next(rows, (0, []))[1]]
+    _check(path, header)
+    return header, rows
 
-    def pick(header: Sequence[str]) -> Sequence[str]:
-        names.extend(header)
-        return ()
 
-    read_log(path, pick)
-    return names
+def _rows(path: str | Path) -> Iterator[tuple[int, list[str]]]:
+    reader = csv.reader(io.StringIO(_text(Path(path))), strict=True, skipinitialspace=True)
+    try:
+        for row in reader:
+            yield reader.line_num, row
+    except csv.Error as error:
+        raise BadInput(f"{path} is no CSV file ({brief(error)}): {NEEDED}") from None
 
 
 def _text(path: Path) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from hyrl_mj.errors import BadInput, counted, unknown
-from hyrl_mj.files.logs import read_log
+from hyrl_mj.files.logs import names_of, read_log
 from hyrl_mj.simulation.column_noise import LEAST, LONGEST_DELAY, ColumnNoise, column_noise
 
 TIMES = ("t", "time")
@@ -95,19 +95,14 @@ def noise_from_log(
         raise BadInput(f"a time of {dt:g} s between rows cannot be used: give one > 0")
     if not 0.5 <= share <= 1:
         raise BadInput(f"a share of {share:g} cannot be used: give one from 0.5 to 1, as 0.999")
-    chosen: list[str] = []
-    clock: list[str] = []
-
-    def pick(header: Sequence[str]) -> list[str]:
-        chosen[:] = _chosen(path, header, columns, at_rest)
-        clock[:] = [name for name in header if name in TIMES][:1]
-        references = [] if at_rest else [f"{name}_ref" for name in chosen]
-        for name in (*turn, *factors):
-            if name not in (*chosen, *references):
-                raise unknown(f"column of {path}", name, [*chosen, *references])
-        return [*clock, *chosen, *references]
-
-    data = read_log(path, pick)
+    header = names_of(path)
+    chosen = _chosen(path, header, columns, at_rest)
+    clock = [name for name in header if name in TIMES][:1]
+    references = [] if at_rest else [f"{name}_ref" for name in chosen]
+    for name in (*turn, *factors):
+        if name not in (*chosen, *references):
+            raise unknown(f"column of {path}", name, [*chosen, *references])
+    data = read_log(path, [*clock, *chosen, *references])
     rows = len(data[chosen[0]])
     if rows < LEAST:
         raise BadInput(f"{path} has {counted(rows, 'row')} of samples: give at least {LEAST}")

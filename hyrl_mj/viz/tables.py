@@ -313,8 +313,8 @@ def robustness_sentence(robustness: Robustness) -> str:
 def noise_table(noise: LogNoise) -> Table:
     """Returns the noise of a log: a row for each column; "-" is what the log does not tell."""
 
-    def told(value: float, unit: str = "") -> str:
-        return "-" if np.isnan(value) else f"{value:.2g}{unit}"
+    def told(value: float) -> str:
+        return "-" if np.isnan(value) else f"{value:.2g}"
 
     rows = []
     for c in noise.columns:
