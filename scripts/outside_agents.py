@@ -93,20 +93,6 @@ def maze(name: str, cell: tuple[int, int]) -> Callable[[], gym.Env]:
     return make
 
 
-class Upright(gym.Wrapper):
-    """A pendulum whose reward tells how upright it is, with inputs that are held for two steps."""
-
-    def step(self, action: Any) -> Any:
-        total = 0.0
-        for _ in range(2):
-            observation, _, terminated, truncated, info = self.env.step(action)
-            inner: Any = self.env.unwrapped
-            total += float(inner._env.physics.pole_vertical() - 1) / 2
-            if terminated or truncated:
-                break
-        return observation, total, terminated, truncated, info
-
-
 def ogbench() -> gym.Env:
     """A maze from any free cell."""
     import ogbench  # noqa: F401
@@ -120,6 +106,7 @@ def ogbench() -> gym.Env:
 
 
 def pendulum() -> gym.Env:
+    """A pendulum whose reward tells how upright it is, with inputs that are held for two steps."""
     import shimmy
     from dm_control.mujoco.wrapper.mjbindings import sizes
 
@@ -128,7 +115,10 @@ def pendulum() -> gym.Env:
         table = sizes.array_sizes[name]
         sizes.array_sizes[name] = {key: table[key] for key in table if hasattr(kind, key)}
     gym.register_envs(shimmy)
-    return Upright(gym.wrappers.FlattenObservation(gym.make("dm_control/pendulum-swingup-v0")))
+    env = gym.wrappers.FlattenObservation(gym.make("dm_control/pendulum-swingup-v0"))
+    physics: Any = env.unwrapped._env.physics
+    upright = gym.wrappers.TransformReward(env, lambda _: float(physics.pole_vertical() - 1) / 2)
+    return gym.wrappers.RepeatAction(upright, 2)
 
 
 def annealed(left: float) -> float:
