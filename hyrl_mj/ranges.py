@@ -36,49 +36,41 @@ def refused(name: str, value: object, allowed: str) -> BadInput:
     return BadInput(f"{name} {shown} cannot be used: give {allowed}")
 
 
-def _is(value: Any, kind: type) -> bool:
-    """Returns whether a value is a number of a kind; True and False are none."""
-    return isinstance(value, kind) and not isinstance(value, bool)
-
-
-@dataclass(frozen=True)
-class Integer:
-    """An integer from `low` to `high`."""
-
-    low: int
-    high: int
-
-    def checked(self, name: str, value: Any) -> int:
-        if not _is(value, Integral) or not self.low <= value <= self.high:
-            raise refused(name, value, self.allowed)
-        return int(value)
-
-    @property
-    def allowed(self) -> str:
-        return f"an integer from {self.low:,} to {self.high:,}"
-
-
 @dataclass(frozen=True)
 class Number:
-    """A number from `low` to `high`, or `above` low."""
+    """A number from `low` to `high`, or `above` low; True and False are none."""
 
     low: float
     high: float
     above: bool = False
 
     def checked(self, name: str, value: Any) -> float:
+        return float(self._within(name, value, Real))
+
+    def _within(self, name: str, value: Any, kind: type) -> Any:
+        is_one = isinstance(value, kind) and not isinstance(value, bool)
         # NaN is not within any range.
-        if not _is(value, Real) or not self.low <= value <= self.high:
+        if not (is_one and self.low <= value <= self.high) or (self.above and value == self.low):
             raise refused(name, value, self.allowed)
-        if self.above and value == self.low:
-            raise refused(name, value, self.allowed)
-        return float(value)
+        return value
 
     @property
     def allowed(self) -> str:
         if self.above:
             return f"a number > {self.low:g} and <= {self.high:g}"
         return f"a number from {self.low:g} to {self.high:g}"
+
+
+@dataclass(frozen=True)
+class Integer(Number):
+    """An integer from `low` to `high`."""
+
+    def checked(self, name: str, value: Any) -> int:
+        return int(self._within(name, value, Integral))
+
+    @property
+    def allowed(self) -> str:
+        return f"an integer from {self.low:,} to {self.high:,}"
 
 
 @dataclass(frozen=True)

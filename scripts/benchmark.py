@@ -17,24 +17,23 @@ import platform
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from benchmarks import Figure, Measured, control, engine, growth, learning, replay, stages, whole
-from benchmarks.runs import Runs
+from benchmarks import Figure, control, engine, growth, learning, replay, runs, stages
 from rich.console import Console
 from rich.table import Table
 
 from hyrl_mj.files import artifacts
 
-GROUPS: dict[str, Callable[[Runs], Iterator[Figure]]] = {
+GROUPS: dict[str, Callable[[runs.Runs], Iterator[Figure]]] = {
     "engine": engine.figures,
     "stages": stages.figures,
     "learning": learning.figures,
     "control": control.figures,
     "replay": replay.figures,
-    "whole": whole.figures,
+    "whole": runs.figures,
 }
 PAIRS = 5
 
@@ -49,18 +48,18 @@ def machine() -> str:
     return f"{cpu}, {os.cpu_count()} cores, Python {platform.python_version()}"
 
 
-def table(results: list[Measured]) -> Table:
+def table(results: list[dict[str, Any]]) -> Table:
     """Returns the results as a table."""
-    printed = Table(title=machine())
-    for heading in ("figure", "ours", "against", "ratio (least - greatest)", "target"):
-        printed.add_column(heading)
+    headings = ("figure", "ours", "against", "ratio (least - greatest)", "target")
+    printed = Table(*headings, title=machine())
     for r in results:
-        ours = f"{r.ours:.4g} {r.unit}" + (f", {r.memory:.0f} MB" if r.memory else "")
-        other, ratio = "", ""
-        if r.other is not None:
-            other = f"{r.other:.4g} {r.unit}: {r.against}"
-            ratio = f"{np.median(r.ratios):.3g} ({min(r.ratios):.3g} - {max(r.ratios):.3g})"
-        printed.add_row(r.name, ours, other, ratio, r.target)
+        ours = f"{r['ours']:.4g} {r['unit']}"
+        ours += f", {r['memory']:.0f} MB" if r["memory"] else ""
+        other, ratio, ratios = "", "", r["ratios"]
+        if ratios:
+            other = f"{r['other']:.4g} {r['unit']}: {r['against']}"
+            ratio = f"{np.median(ratios):.3g} ({min(ratios):.3g} - {max(ratios):.3g})"
+        printed.add_row(r["name"], ours, other, ratio, r["target"])
     return printed
 
 
@@ -76,18 +75,18 @@ def main() -> None:
     results = []
     with tempfile.TemporaryDirectory() as folder:
         preset = "smoke" if options.quick and not options.runs else "fast"
-        runs = Runs(options.runs or Path(folder), preset)
+        made = runs.Runs(options.runs or Path(folder), preset)
         for group in options.only:
-            for figure in GROUPS[group](runs):
+            for figure in GROUPS[group](made):
                 if figure.slow and options.quick:
                     continue
                 print(f"{figure.name} ...", file=sys.stderr, flush=True)
                 results.append(figure.measure(1 if options.quick else PAIRS))
         if options.growth:
-            growth.plot(runs.path("vehicle"), options.growth)
+            growth.plot(made.path("vehicle"), options.growth)
     Console(width=None if sys.stdout.isatty() else 200).print(table(results))
     if options.json:
-        content = {"machine": machine(), "figures": [asdict(result) for result in results]}
+        content = {"machine": machine(), "figures": results}
         artifacts.write_json(options.json, content, kind="benchmark")
 
 

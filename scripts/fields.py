@@ -1,13 +1,20 @@
-"""Fields put to the test: prints how often the controllers of a run of `field` arrive and crash.
+"""Fields put to the test: prints what becomes of the runs of the controllers of a run of `field`.
 
     hyrl-mj run field --seed 0 --out runs/field-0
     python scripts/fields.py published runs/field-0 fields.json
     python scripts/fields.py random runs/field-0 --fields 1000
     python scripts/fields.py random runs/field-0 --fields 300 --moving
+    python scripts/fields.py rows runs/field-0 --fields 99 --starts 4
+    python scripts/fields.py rows runs/field-0 --fields 200 --starts 3 --posts 9 --moving
     python scripts/fields.py many runs/field-0
 
 `published` takes layouts in the format of the published work (HybridSystemsLab/MultiHyRL), `random` draws
 fields of 3 to 12 posts, and `many` times 1,000 fields of 12 posts.
+
+`rows` asks what does the work: a controller has the memory of focus and side or not, the guard or not, and in
+its modes what was trained, a law that drives along the way, or random inputs. Half of its starts are on M*.
+Time and way are those of runs that arrive; late is what takes more than twice the time of the same controller
+without noise.
 """
 
 from __future__ import annotations
@@ -15,8 +22,10 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -24,61 +33,74 @@ from rich.console import Console
 from rich.table import Table
 
 import hyrl_mj
-from hyrl_mj.fields import Bounds, Driving, controllers, decoded
+from hyrl_mj.fields import Bounds, Driving, FocusController, controllers, decoded
+from hyrl_mj.fields.controller import TangentLaw, WithoutMemory
+from hyrl_mj.fields.guard import Guard
 from hyrl_mj.judging import Budget, attack
-from hyrl_mj.policies import Controller
+from hyrl_mj.judging.game import LATE
+from hyrl_mj.policies import Controller, PolicyController
 from hyrl_mj.simulation import AnyNoise, LoopSettings, Noise, Recorded, closed_loop
-from hyrl_mj.tasks import Layouts, Outcome
+from hyrl_mj.tasks import LEFT, RIGHT, Layouts, Outcome
 
-# Random fields: half the side of the square of the posts [m], radii [m], least gap [m], speed [m/s], and the
-# time between two positions of a moving post [s].
-HALF, RADII, GAP, SPEED, INTERVAL = 5.0, (0.3, 0.9), 0.8, 0.4, 2.0
+# Random fields: half the side of the square of the posts [m], radii [m], least gap [m], speed [m/s], the
+# time between two positions of a moving post [s], and the room around a start [m].
+HALF, RADII, GAP, SPEED, INTERVAL, ROOM = 5.0, (0.3, 0.9), 0.8, 0.4, 2.0, 0.3
 TIME, LONG = 15.0, 30.0
 BATCH = 2_000
 
 
+# ---- what becomes of runs
+
+
 @dataclass
 class Tally:
-    """What happened in some runs.
+    """What happened in some runs: a value for each.
 
     Attributes:
-        outcomes: of the runs, by their labels.
-        changes: number of changes of (q, lambda) of each run, and number of posts passed.
+        outcomes: their labels.
+        times, ways: how long [s] and how far [m] they go.
+        changes, passed: numbers of changes of (q, lambda), and of posts passed; none without a memory.
     """
 
-    outcomes: dict[str, int] = field(default_factory=dict)
+    outcomes: list[str] = field(default_factory=list)
+    times: list[float] = field(default_factory=list)
+    ways: list[float] = field(default_factory=list)
     changes: list[int] = field(default_factory=list)
     passed: list[int] = field(default_factory=list)
 
-    def add(self, outcome: np.ndarray) -> None:
-        for value in outcome:
-            label = Outcome(value).label
-            self.outcomes[label] = self.outcomes.get(label, 0) + 1
+    def cells(self, *labels: str) -> list[str]:
+        """Returns the number of runs, and of those with each label."""
+        return [f"{n:,}" for n in (len(self.outcomes), *map(self.outcomes.count, labels))]
 
     def row(self) -> list[str]:
-        runs = sum(self.outcomes.values())
-        cells = [f"{runs:,}", *(f"{self.outcomes.get(k, 0):,}" for k in ("crashed", "stalled"))]
+        cells = self.cells("crashed", "stalled")
         if not self.changes:
             return [*cells, "", ""]
-        few = np.array(self.changes) <= np.array(self.passed) + 1
-        twice = np.array(self.changes) <= 2 * (np.array(self.passed) + 1)
+        most = np.array(self.passed) + 1
+        few, twice = (np.array(self.changes) <= n * most for n in (1, 2))
         return [*cells, f"{np.median(self.changes):.0f} ({few.mean():.1%})", f"{twice.mean():.2%}"]
 
 
 def drive(
-    task: Driving, loop: Controller, z0: np.ndarray, noise: AnyNoise | None, tally: Tally
-) -> np.ndarray:
-    """Runs a controller from starts and counts; returns the outcomes (n,)."""
-    ends = []
+    task: Driving,
+    loop: Controller,
+    z0: np.ndarray,
+    noise: AnyNoise | None,
+    tally: Tally,
+    seed: int = 0,
+) -> None:
+    """Runs a controller from starts, and counts."""
     for first in range(0, len(z0), BATCH):
         part = z0[first : first + BATCH]
         settings = LoopSettings(record=True, quiet=True)
-        run = closed_loop(task, loop, part, noise, settings=settings)
-        tally.add(run.outcome)
-        ends.append(run.outcome)
+        run = closed_loop(task, loop, part, noise, seed=seed, settings=settings)
+        tally.outcomes += [Outcome(value).label for value in run.outcome]
+        tally.times += (run.length * task.dt).tolist()
+        moves = np.linalg.norm(np.diff(run.path[..., :2], axis=0), axis=2)
+        during = np.arange(len(moves))[:, None] < run.length
+        tally.ways += (moves * during).sum(axis=0).tolist()
         if len(loop.modes) > 1:
             count_changes(task, part, run, tally)
-    return np.concatenate(ends)
 
 
 def drive_attacked(
@@ -86,8 +108,7 @@ def drive_attacked(
 ) -> None:
     """Runs a controller from starts under the worst noise that so many rounds find, and counts."""
     found = attack(task, {who: loop}, z0, 0.1, Budget(rounds=rounds))[who]
-    for arc in found.arcs:
-        tally.outcomes[arc.outcome] = tally.outcomes.get(arc.outcome, 0) + 1
+    tally.outcomes += [arc.outcome for arc in found.arcs]
 
 
 def count_changes(task: Driving, z0: np.ndarray, run, tally: Tally) -> None:
@@ -108,6 +129,9 @@ def count_changes(task: Driving, z0: np.ndarray, run, tally: Tally) -> None:
     during = np.arange(last)[:, None, None] <= length[:, None]
     near = np.where(during, room, np.inf).min(axis=0) < 1.0
     tally.passed += near.sum(axis=1).tolist()
+
+
+# ---- fields and starts
 
 
 def published(path: Path) -> Iterator[tuple[str, Layouts, np.ndarray]]:
@@ -136,11 +160,8 @@ def published(path: Path) -> Iterator[tuple[str, Layouts, np.ndarray]]:
             )
         away = starts["radius_m"] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
         heading = np.arctan2(-away[:, 1], -away[:, 0])
-        yield (
-            name,
-            Layouts(np.stack(tracks, axis=1)[None], np.array([radii]), goal, 0.25),
-            np.column_stack([goal + away, heading]),
-        )
+        layouts = Layouts(np.stack(tracks, axis=1)[None], np.array([radii]), goal, 0.25)
+        yield name, layouts, np.column_stack([goal + away, heading])
 
 
 def published_noise(task: Driving, n: int, place: float, heading: float) -> Recorded:
@@ -148,9 +169,7 @@ def published_noise(task: Driving, n: int, place: float, heading: float) -> Reco
     values = np.zeros(task.measurement_columns)
     values[:3] = place, -place, heading
     signs = np.where(np.arange(task.max_steps) % 2 == 0, 1.0, -1.0)
-    signal = np.broadcast_to(
-        (signs[:, None] * values)[:, None], (task.max_steps, n, task.measurement_columns)
-    )
+    signal = np.broadcast_to((signs[:, None] * values)[:, None], (len(signs), n, len(values)))
     return Recorded(signal, max(place, heading), "alternating")
 
 
@@ -160,168 +179,265 @@ def drawn(rng: np.random.Generator, posts: int, fields: int, moving: bool) -> La
     tracks = np.empty((fields, segments + 1, posts, 2))
     radii, goals = np.empty((fields, posts)), np.empty((fields, 2))
     for i in range(fields):
-        places: list[np.ndarray] = []
-        sizes: list[float] = []
-        while len(places) < posts:
+        count = 0
+        while count < posts:
             place, radius = rng.uniform(-HALF, HALF, 2), rng.uniform(*RADII)
-            if all(
-                np.linalg.norm(place - p) >= radius + r + GAP
-                for p, r in zip(places, sizes, strict=True)
-            ):
-                places.append(place)
-                sizes.append(radius)
-        radii[i], tracks[i] = sizes, np.array(places)
+            away = np.linalg.norm(place - tracks[i, 0, :count], axis=1) - radii[i, :count]
+            if (away >= radius + GAP).all():
+                tracks[i, :, count], radii[i, count] = place, radius
+                count += 1
         while True:
             goals[i] = rng.uniform(-HALF - 1, HALF + 1, 2)
-            room = np.linalg.norm(tracks[i, 0] - goals[i], axis=1) - radii[i]
-            if room.min() >= 0.5:
+            if (np.linalg.norm(tracks[i, 0] - goals[i], axis=1) - radii[i]).min() >= 0.5:
                 break
         for k in range(segments):
             going = np.arange(posts) % 2 == 0
             course, speed = rng.uniform(-np.pi, np.pi, posts), rng.uniform(0, SPEED, posts)
-            step = (
-                INTERVAL
-                * (speed * going)[:, None]
-                * np.stack([np.cos(course), np.sin(course)], axis=1)
-            )
-            tracks[i, k + 1] = tracks[i, k] + step
+            course = np.stack([np.cos(course), np.sin(course)], axis=1)
+            tracks[i, k + 1] = tracks[i, k] + INTERVAL * (speed * going)[:, None] * course
     return Layouts(tracks, radii, goals, INTERVAL)
 
 
-def starts_anywhere(
-    layouts: Layouts, each: int, rng: np.random.Generator, room: float = 0.3
+def starts(
+    layouts: Layouts, each: int, rng: np.random.Generator, points: np.ndarray | None = None
 ) -> np.ndarray:
-    """Returns starts (n, 4): so many anywhere in each field, with room around them, away from the goal."""
+    """Returns starts (n, 4), so many in each field, with room around them, away from the goal.
+
+    They lie anywhere, or on the `points` (k, 3) of M*, as these lie around a post of the field.
+    """
     z = []
     for i in range(len(layouts)):
         while len(z) < (i + 1) * each:
-            place = rng.uniform(-HALF - 1, HALF + 1, 2)
-            if free(layouts, i, place, room):
-                z.append([*place, rng.uniform(-np.pi, np.pi), i])
+            if points is None:
+                place = rng.uniform(-HALF - 1, HALF + 1, 2)
+            else:
+                post = layouts.tracks[i, 0, rng.integers(layouts.posts)]
+                along, across, heading = points[rng.integers(len(points))]
+                axis = layouts.goals[i] - post
+                angle = np.arctan2(axis[1], axis[0])
+                cos, sin = np.cos(angle), np.sin(angle)
+                place = post + np.array([along * cos - across * sin, along * sin + across * cos])
+            away = np.linalg.norm(layouts.tracks[i, 0] - place, axis=1) - layouts.radii[i]
+            if away.min() < ROOM or np.linalg.norm(place - layouts.goals[i]) < 1.0:
+                continue
+            if points is None:
+                turned = rng.uniform(-np.pi, np.pi)
+            else:
+                turned = np.angle(np.exp(1j * (heading + angle)))
+            z.append([*place, turned, i])
     return np.array(z)
 
 
-def starts_on_critical(
-    layouts: Layouts, points: np.ndarray, each: int, rng: np.random.Generator, room: float = 0.3
-) -> np.ndarray:
-    """Returns starts (n, 4) on M*, as it lies around a post of each field."""
-    z = []
-    for i in range(len(layouts)):
-        while len(z) < (i + 1) * each:
-            post = layouts.tracks[i, 0, rng.integers(layouts.posts)]
-            along, across, heading = points[rng.integers(len(points))]
-            axis = layouts.goals[i] - post
-            angle = np.arctan2(axis[1], axis[0])
-            cos, sin = np.cos(angle), np.sin(angle)
-            place = post + np.array([along * cos - across * sin, along * sin + across * cos])
-            if free(layouts, i, place, room):
-                z.append([*place, np.angle(np.exp(1j * (heading + angle))), i])
-    return np.array(z)
+# ---- the controllers of the rows
 
 
-def free(layouts: Layouts, i: int, place: np.ndarray, room: float) -> bool:
-    """Returns whether a place in a field has room around it, and is not the goal."""
-    away = np.linalg.norm(layouts.tracks[i, 0] - place, axis=1) - layouts.radii[i]
-    return bool(away.min() >= room and np.linalg.norm(place - layouts.goals[i]) >= 1.0)
+class Random:
+    """Gives inputs at random, but the same for the same observation, as controllers have to."""
+
+    def __init__(self, seed: int):
+        self._weights = np.random.default_rng(seed).uniform(-1e4, 1e4, (17, 2))
+
+    def inputs(self, observed: np.ndarray) -> np.ndarray:
+        """Returns inputs (n, 2) for observations (n, 17)."""
+        # A sum of products that does not depend on how many observations there are.
+        return np.sin((observed[:, :, None] * self._weights).sum(axis=1))
+
+
+@dataclass(frozen=True)
+class Counting(Guard):
+    """A guard that counts the samples that it sees and changes; it changes nothing if it is not `acting`."""
+
+    acting: bool = True
+    count: Counter[str] = field(default_factory=Counter)
+
+    def inputs(self, seen, u, turn, sense):
+        guarded = super().inputs(seen, u, turn, sense)
+        changed = int((np.abs(guarded - u) > 1e-6).any(axis=1).sum())
+        self.count.update(seen=len(u), changed=changed)
+        return guarded if self.acting else u
+
+
+@dataclass(frozen=True)
+class Parts(FocusController):
+    """The controller of fields with its memory, its guard, or without one of them."""
+
+    remembers: bool = True
+    guarded: bool = True
+
+    @cached_property
+    def guard(self) -> Counting:
+        return Counting(**vars(super().guard), acting=self.guarded)
+
+    def answer(self, q: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return super().answer(q if self.remembers else np.full_like(q, -1), measured)
+
+
+def rows_of(run: hyrl_mj.Run, task: Driving, seed: int) -> dict[str, Controller]:
+    """Returns the controllers by what they are made of."""
+    eps, trained = run.settings.eps, run.mode_policies
+    law: Mapping = {side: TangentLaw(task.local, side) for side in (LEFT, RIGHT)}
+    drawing: Mapping = dict.fromkeys((LEFT, RIGHT), Random(seed))
+
+    def parts(policies: Mapping, memory: bool, guarded: bool) -> Parts:
+        return Parts(task, policies, eps, remembers=memory, guarded=guarded)
+
+    return {
+        "policy of stage 1 alone": PolicyController(WithoutMemory(task, run.policy)),
+        "learned, neither": parts(trained, False, False),
+        "learned, memory": parts(trained, True, False),
+        "learned, guard": parts(trained, False, True),
+        "learned, both (HyRL)": parts(trained, True, True),
+        "law, both": parts(law, True, True),
+        "random, guard": parts(drawing, False, True),
+    }
+
+
+@dataclass
+class Row:
+    """What became of the runs of one controller: as given, without noise, under attack, and by its guard."""
+
+    noisy: Tally = field(default_factory=Tally)
+    quiet: Tally = field(default_factory=Tally)
+    lost: list[bool] = field(default_factory=list)
+    guard: Counter[str] = field(default_factory=Counter)
+
+    def cells(self) -> list[str]:
+        arrived = np.array(self.noisy.outcomes) == "reached"
+        times, ways, quiet = map(np.array, (self.noisy.times, self.noisy.ways, self.quiet.times))
+        spread = [
+            np.percentile(x[arrived], (50, 99)) if arrived.any() else (np.nan, np.nan)
+            for x in (times, ways)
+        ]
+        changes = np.array(self.noisy.changes)
+        beyond = changes - np.array(self.noisy.passed) - 1
+        return [
+            *self.noisy.cells("reached", "crashed"), f"{(arrived & (times > LATE * quiet)).sum()}",
+            *("{:.1f}, {:.1f}".format(*pair) for pair in spread),
+            f"{self.guard['changed'] / self.guard['seen']:.0%}" if self.guard else "",
+            f"{np.median(changes):.0f}, {np.percentile(changes, 99):.0f}" if len(changes) else "",
+            f"{np.median(beyond):.0f}, {(beyond > 0).mean():.0%}" if len(changes) else "",
+            f"{sum(self.lost):,} of {len(self.lost):,}" if self.lost else "",
+        ]  # fmt: skip
+
+
+# ---- the commands
 
 
 def loops_of(run: hyrl_mj.Run, task: Driving) -> dict[str, Controller]:
     return controllers(task, run.policy, run.mode_policies, run.settings.eps)
 
 
-def try_published(run: hyrl_mj.Run, path: Path, rounds: int, table: Table) -> None:
-    pairs = json.loads(path.read_text())["noise"]
-    for name, layouts, starts in published(path):
-        for place, heading in pairs:
-            task = Driving(run.task, layouts, Bounds(), 0.1 + place, TIME, starts)
+def try_published(run: hyrl_mj.Run, given: argparse.Namespace) -> Table:
+    table = Table("field", "noise", *COUNTS)
+    pairs = json.loads(given.file.read_text())["noise"]
+    for name, layouts, z0 in published(given.file):
+        for pair in [*pairs, None] if given.rounds else pairs:
+            about = 0.2 if pair is None else 0.1 + pair[0]
+            task = Driving(run.task, layouts, Bounds(), about, TIME, z0)
             for who, loop in loops_of(run, task).items():
                 tally = Tally()
-                for side in (None, 0, 1) if who != "policy" else (None,):
-                    begun = loop if side is None else loop.on_side(side)
-                    drive(
-                        task,
-                        begun,
-                        starts,
-                        published_noise(task, len(starts), place, heading),
-                        tally,
-                    )
-                table.add_row(name, f"{place:g}, {heading:g}", who, *tally.row())
-        if rounds:
-            task = Driving(run.task, layouts, Bounds(), 0.2, TIME, starts)
-            for who, loop in loops_of(run, task).items():
-                tally = Tally()
-                for side in (None, 0, 1) if who != "policy" else (None,):
-                    begun = loop if side is None else loop.on_side(side)
-                    drive_attacked(task, who, begun, starts, rounds, tally)
-                table.add_row(name, "attack 0.1, 0.05", who, *tally.row())
+                for begun in (loop, *(loop.on_side(q) for q in (0, 1) if who != "policy")):
+                    if pair is None:
+                        drive_attacked(task, who, begun, z0, given.rounds, tally)
+                    else:
+                        drive(task, begun, z0, published_noise(task, len(z0), *pair), tally)
+                noise = "attack 0.1, 0.05" if pair is None else "{:g}, {:g}".format(*pair)
+                table.add_row(name, noise, who, *tally.row())
+    return table
 
 
-def try_random(
-    run: hyrl_mj.Run, count: int, each: int, moving: bool, rounds: int, seed: int, table: Table
-) -> None:
+def try_random(run: hyrl_mj.Run, given: argparse.Namespace) -> Table:
     tallies: dict[tuple[str, str, str], Tally] = {}
-    bounds = Bounds(speeds=0.5) if moving else Bounds()
+    bounds, points = Bounds(speeds=0.5 * given.moving), run.critical_set.points
     for posts in range(3, 13):
-        rng = np.random.default_rng([seed, posts])
-        layouts = drawn(rng, posts, max(count // 10, 2), moving)
+        rng = np.random.default_rng([given.seed, posts])
+        layouts = drawn(rng, posts, max(given.fields // 10, 2), given.moving)
         task = Driving(run.task, layouts, bounds, 0.2, LONG)
-        points = run.critical_set.points
         from_where = {
-            "M*": starts_on_critical(layouts, points, each, rng),
-            "anywhere": starts_anywhere(layouts, each, rng),
+            "M*": starts(layouts, given.starts, rng, points),
+            "anywhere": starts(layouts, given.starts, rng),
         }
         for who, loop in loops_of(run, task).items():
             for where, z0 in from_where.items():
                 for kind in ("none", "alternating", "uniform"):
                     tally = tallies.setdefault((where, kind, who), Tally())
                     drive(task, loop, z0, Noise(kind, 0.1), tally)
-                if rounds:
+                if given.rounds:
                     tally = tallies.setdefault((where, "attack", who), Tally())
-                    drive_attacked(task, who, loop, z0[::each], rounds, tally)
+                    drive_attacked(task, who, loop, z0[:: given.starts], given.rounds, tally)
+    table = Table("field", "noise", *COUNTS)
     for key in sorted(tallies):
         table.add_row(*key, *tallies[key].row())
+    return table
 
 
-def try_many(run: hyrl_mj.Run) -> None:
+def try_rows(run: hyrl_mj.Run, given: argparse.Namespace) -> Table:
+    rows: dict[str, Row] = {}
+    bounds = Bounds(speeds=0.5 * given.moving)
+    for posts in given.posts:
+        rng = np.random.default_rng([given.seed, posts])
+        layouts = drawn(rng, posts, max(given.fields // len(given.posts), 2), given.moving)
+        task = Driving(run.task, layouts, bounds, 0.2, LONG)
+        near = given.starts // 2
+        z0 = starts(layouts, given.starts - near, rng)
+        if near:
+            z0 = np.vstack([starts(layouts, near, rng, run.critical_set.points), z0])
+        loops = rows_of(run, task, given.seed)
+        for name, loop in loops.items():
+            row = rows.setdefault(name, Row())
+            drive(task, loop, z0, None, row.quiet, given.seed)
+            if isinstance(loop, Parts):
+                loop.guard.count.clear()
+            drive(task, loop, z0, Noise(given.noise, 0.1), row.noisy, given.seed)
+            if isinstance(loop, Parts):
+                row.guard += loop.guard.count
+        if given.rounds:
+            tried = {name: loop for name, loop in loops.items() if not name.startswith("random")}
+            budget = Budget(rounds=given.rounds)
+            found = attack(task, tried, z0[:: given.starts], 0.1, budget, seed=given.seed)
+            for name, result in found.items():
+                rows[name].lost += (result.ends.lost & ~result.quiet.lost).tolist()
+    table = Table(
+        "controller", "runs", "arrives", "crashes", "late", "time, s: median, 99%", "way, m: median, 99%",
+        "changed by the guard", "changes: median, 99%", "beyond posts passed + 1: median, share",
+        "attack: lost",
+    )  # fmt: skip
+    for name, row in rows.items():
+        table.add_row(name, *row.cells())
+    return table
+
+
+def try_many(run: hyrl_mj.Run, given: argparse.Namespace) -> str:
     rng = np.random.default_rng(0)
     layouts = drawn(rng, 12, 1_000, False)
-    z0 = starts_anywhere(layouts, 1, rng)
+    z0 = starts(layouts, 1, rng)
     task = Driving(run.task, layouts, Bounds(), 0.2, LONG)
     began = time.monotonic()
     loop, settings = loops_of(run, task)["hyrl"], LoopSettings(quiet=True)
     closed_loop(task, loop, z0, Noise("alternating", 0.1), settings=settings)
-    print(f"1,000 fields of 12 posts: {time.monotonic() - began:.1f} s")
+    return f"1,000 fields of 12 posts: {time.monotonic() - began:.1f} s"
+
+
+COUNTS = ("controller", "runs", "crashed", "late", "changes (few)", "twice")
+TRIALS = {"published": try_published, "random": try_random, "rows": try_rows, "many": try_many}
 
 
 def main() -> None:
     style = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=style)
-    parser.add_argument("what", choices=("published", "random", "many"))
+    parser.add_argument("what", choices=TRIALS)
     parser.add_argument("run", type=Path)
     parser.add_argument("file", type=Path, nargs="?")
     parser.add_argument("--fields", type=int, default=100)
-    parser.add_argument("--starts", type=int, default=10)
-    parser.add_argument("--moving", action="store_true")
-    parser.add_argument(
-        "--rounds",
-        type=int,
-        default=0,
-        help="rounds of the attack; of a random field one start in STARTS is attacked",
-    )
+    parser.add_argument("--starts", type=int, default=10, help="of each field")
+    parser.add_argument("--moving", action="store_true", help="half of the posts move")
+    about = "rounds of the attack; of a random field one start in STARTS is attacked"
+    parser.add_argument("--rounds", type=int, default=0, help=about)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--posts", type=int, nargs="+", default=(4, 8, 12), help="of rows")
+    parser.add_argument("--noise", default="alternating", help="of rows")
     given = parser.parse_args()
-    run = hyrl_mj.load_run(given.run)
-    table = Table(
-        "field", "noise", "controller", "runs", "crashed", "late", "changes (few)", "twice"
-    )
-    if given.what == "published":
-        try_published(run, given.file, given.rounds, table)
-    elif given.what == "random":
-        try_random(run, given.fields, given.starts, given.moving, given.rounds, given.seed, table)
-    else:
-        try_many(run)
-        return
-    Console(width=140).print(table)
+    Console(width=170).print(TRIALS[given.what](hyrl_mj.load_run(given.run), given))
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ from hyrl_mj.judging import Budget, Regions, attack, noisy_episodes
 from hyrl_mj.judging.game import Lattice
 from hyrl_mj.simulation import KINDS, WayRuns, way_runs
 from hyrl_mj.system import progress
+from hyrl_mj.system.streams import Streams
 from hyrl_mj.tasks import ANY, LEFT, RIGHT, pattern_of
 from hyrl_mj.tasks.pillar import PostsTask
 
@@ -33,11 +34,9 @@ def confirmed(run: hyrl_mj.Run) -> float:
     task, critical = run.task, run.critical_set
     parted = np.zeros(len(critical.points), dtype=bool)
     for aside in np.diag(np.multiply(critical.spacing, task.chart.scale)):
+        ends = (task.chart.wrap(critical.points + way) for way in (aside, -aside))
         first, second = (
-            WayRuns.from_rollout(
-                task, way_runs(task, run.steady, task.chart.wrap(critical.points + way))
-            )
-            for way in (aside, -aside)
+            WayRuns.from_rollout(task, way_runs(task, run.steady, end)) for end in ends
         )
         parted |= first.shows & second.shows & first.differ(second)
     return float(parted.mean())
@@ -53,16 +52,11 @@ def equal_returns(run: hyrl_mj.Run) -> np.ndarray:
     lattice = Lattice.tabulate(task, run.lattice_grid)
     nodes, after = lattice.grid.nodes, lattice.after[:, 0]
     centres, _ = task.posts
-    end = np.minimum(
-        after, lattice.nodes - 1
-    )  # what has arrived or failed is worth nothing any more
+    # What has arrived or failed is worth nothing any more.
+    end = np.minimum(after, lattice.nodes - 1)
     runs_on = (after < lattice.nodes) & lattice.running[end]
-    reward = np.stack(
-        [
-            task.reward(nodes[e], np.tile(u, (len(e), 1)))
-            for e, u in zip(end, lattice.levels, strict=True)
-        ]
-    )
+    each = zip(end, lattice.levels, strict=True)
+    reward = np.stack([task.reward(nodes[e], np.tile(u, (len(e), 1))) for e, u in each])
     values = []
     for mode in run.controller.modes:
         barred = np.zeros(len(nodes), dtype=bool)
@@ -107,9 +101,8 @@ def measure(run: hyrl_mj.Run, count: int) -> dict[str, str]:
     if (game := run.robustness.game) is not None:
         for name in run.controllers:
             score = game.scores[name][-1]
-            row[f"{name}: proved, own q0, of what is open"] = (
-                f"{score.proved * score.winnable / score.open:.2%}"
-            )
+            share = score.proved * score.winnable / score.open
+            row[f"{name}: proved, own q0, of what is open"] = f"{share:.2%}"
     return row
 
 
@@ -120,21 +113,14 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=10_000)
     options = parser.parse_args()
     progress.enabled = sys.stderr.isatty()
-    table = Table(
-        title=f"{options.episodes} episodes of each noise, and starts of the attack, near M*"
-    )
     rows = [measure(hyrl_mj.load_run(path), options.episodes) for path in options.runs]
     headings = list(dict.fromkeys(name for row in rows for name in row))
-    for heading in headings:
-        table.add_column(heading)
+    title = f"{options.episodes} episodes of each noise, and starts of the attack, near M*"
+    table = Table(*headings, title=title)
     for row in rows:
         table.add_row(*(row.get(name, "-") for name in headings))
     Console(width=None if sys.stdout.isatty() else 220).print(table)
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except hyrl_mj.HyrlError as error:
-        print(error, file=sys.stderr)
-        sys.exit(error.exit_status)
+    sys.exit(Streams().run(main))

@@ -10,7 +10,7 @@ same kind of machine.
 import argparse
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,17 +26,16 @@ from stable_baselines3.common.evaluation import evaluate_policy
 TARGET = (-0.15, 0.0)
 
 
-class PinnedTarget(gym.Wrapper):
-    """Reacher with its target at one place, from any pose of its arm."""
+class From(gym.Wrapper):
+    """An environment that is placed anew after each reset, by a function that returns the observation."""
 
-    def reset(self, **options: Any) -> tuple[np.ndarray, dict[str, Any]]:
+    def __init__(self, env: gym.Env, place: Callable[[Any], Any]):
+        super().__init__(env)
+        self._place = place
+
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
         _, info = self.env.reset(**options)
-        inner: Any = self.env.unwrapped
-        qpos, qvel = inner.data.qpos.copy(), inner.data.qvel.copy()
-        qpos[:2] = inner.np_random.uniform((-np.pi, -2.8), (np.pi, 2.8))
-        qpos[2:4] = TARGET
-        inner.set_state(qpos, qvel)
-        return inner._get_obs(), info
+        return self._place(self.env.unwrapped), info
 
 
 class WithOptions(gym.Wrapper):
@@ -57,22 +56,31 @@ class Agent:
     Attributes:
         make: makes its environment.
         samples: number of samples.
+        options: the arguments of the algorithm.
         policy: SB3's name of its policy.
         kind: SB3's algorithm.
-        options: its arguments.
         copies: number of environments.
     """
 
     make: Callable[[], gym.Env]
     samples: int
+    options: dict[str, Any]
     policy: str = "MlpPolicy"
     kind: type[PPO] | type[SAC] = PPO
-    options: dict[str, Any] = field(default_factory=dict)
     copies: int = 16
 
 
 def reacher() -> gym.Env:
-    return PinnedTarget(gym.make("Reacher-v5"))
+    """Reacher with its target at one place, from any pose of its arm."""
+
+    def place(inner: Any) -> np.ndarray:
+        qpos, qvel = inner.data.qpos.copy(), inner.data.qvel.copy()
+        qpos[:2] = inner.np_random.uniform((-np.pi, -2.8), (np.pi, 2.8))
+        qpos[2:4] = TARGET
+        inner.set_state(qpos, qvel)
+        return inner._get_obs()
+
+    return From(gym.make("Reacher-v5"), place)
 
 
 def maze(name: str, cell: tuple[int, int]) -> Callable[[], gym.Env]:
@@ -85,41 +93,20 @@ def maze(name: str, cell: tuple[int, int]) -> Callable[[], gym.Env]:
     return make
 
 
-class AnyCell(gym.Wrapper):
-    """A maze of OGBench from any free cell."""
-
-    def reset(self, **options: Any) -> tuple[np.ndarray, dict[str, Any]]:
-        _, info = self.env.reset(**options)
-        inner: Any = self.env.unwrapped
-        cells = np.argwhere(inner.maze_map == 0)
-        place = inner.ij_to_xy(inner.np_random.choice(cells)) + inner.np_random.uniform(
-            -1.5, 1.5, 2
-        )
-        inner.set_xy(place)
-        return inner.get_ob(), info
-
-
-class Upright(gym.Wrapper):
-    """A pendulum whose reward tells how upright it is, with inputs that are held for two steps."""
-
-    def step(self, action: Any) -> Any:
-        total = 0.0
-        for _ in range(2):
-            observation, _, terminated, truncated, info = self.env.step(action)
-            inner: Any = self.env.unwrapped
-            total += float(inner._env.physics.pole_vertical() - 1) / 2
-            if terminated or truncated:
-                break
-        return observation, total, terminated, truncated, info
-
-
 def ogbench() -> gym.Env:
+    """A maze from any free cell."""
     import ogbench  # noqa: F401
 
-    return AnyCell(gym.make("pointmaze-medium-singletask-v0", add_noise_to_goal=False))
+    def place(inner: Any) -> np.ndarray:
+        cell = inner.ij_to_xy(inner.np_random.choice(np.argwhere(inner.maze_map == 0)))
+        inner.set_xy(cell + inner.np_random.uniform(-1.5, 1.5, 2))
+        return inner.get_ob()
+
+    return From(gym.make("pointmaze-medium-singletask-v0", add_noise_to_goal=False), place)
 
 
 def pendulum() -> gym.Env:
+    """A pendulum whose reward tells how upright it is, with inputs that are held for two steps."""
     import shimmy
     from dm_control.mujoco.wrapper.mjbindings import sizes
 
@@ -128,7 +115,10 @@ def pendulum() -> gym.Env:
         table = sizes.array_sizes[name]
         sizes.array_sizes[name] = {key: table[key] for key in table if hasattr(kind, key)}
     gym.register_envs(shimmy)
-    return Upright(gym.wrappers.FlattenObservation(gym.make("dm_control/pendulum-swingup-v0")))
+    env = gym.wrappers.FlattenObservation(gym.make("dm_control/pendulum-swingup-v0"))
+    physics: Any = env.unwrapped._env.physics
+    upright = gym.wrappers.TransformReward(env, lambda _: float(physics.pole_vertical() - 1) / 2)
+    return gym.wrappers.RepeatAction(upright, 2)
 
 
 def annealed(left: float) -> float:
@@ -136,54 +126,22 @@ def annealed(left: float) -> float:
     return 1e-3 * left
 
 
+def net(*hidden: int) -> dict[str, Any]:
+    return {"policy_kwargs": {"net_arch": list(hidden)}}
+
+
+SHORT = {"n_steps": 128, "batch_size": 512, "learning_rate": 1e-3, "gamma": 0.98}
 LONG = {"n_steps": 256, "batch_size": 1024, "n_epochs": 6, "gamma": 0.995, "learning_rate": 1e-3}
+LONG["ent_coef"] = 0.003
+LARGE = {**LONG, "gamma": 0.997, "gae_lambda": 0.98, **net(128, 128)}
+SWING = {"learning_starts": 2_000, "gradient_steps": 4, "learning_rate": 1e-3, "gamma": 0.99}
+medium, large = maze("PointMaze_Medium-v3", (6, 6)), maze("PointMaze_Large-v3", (3, 6))
 AGENTS = {
-    "reacher": Agent(
-        reacher,
-        600_000,
-        options={"n_steps": 128, "batch_size": 512, "learning_rate": 1e-3, "gamma": 0.98},
-    ),
-    "point-maze": Agent(
-        maze("PointMaze_Medium-v3", (6, 6)),
-        1_500_000,
-        "MultiInputPolicy",
-        options={**LONG, "ent_coef": 0.003},
-    ),
-    "point-maze-large": Agent(
-        maze("PointMaze_Large-v3", (3, 6)),
-        3_000_000,
-        "MultiInputPolicy",
-        options={
-            **LONG,
-            "ent_coef": 0.003,
-            "gamma": 0.997,
-            "gae_lambda": 0.98,
-            "policy_kwargs": {"net_arch": [128, 128]},
-        },
-    ),
-    "ogbench": Agent(
-        ogbench,
-        3_000_000,
-        options={
-            **LONG,
-            "ent_coef": 0.003,
-            "learning_rate": annealed,
-            "policy_kwargs": {"net_arch": [128, 128]},
-        },
-    ),
-    "pendulum": Agent(
-        pendulum,
-        60_000,
-        kind=SAC,
-        options={
-            "learning_starts": 2_000,
-            "gradient_steps": 4,
-            "learning_rate": 1e-3,
-            "gamma": 0.99,
-            "policy_kwargs": {"net_arch": [64, 64]},
-        },
-        copies=4,
-    ),
+    "reacher": Agent(reacher, 600_000, SHORT),
+    "point-maze": Agent(medium, 1_500_000, LONG, "MultiInputPolicy"),
+    "point-maze-large": Agent(large, 3_000_000, LARGE, "MultiInputPolicy"),
+    "ogbench": Agent(ogbench, 3_000_000, {**LONG, "learning_rate": annealed, **net(128, 128)}),
+    "pendulum": Agent(pendulum, 60_000, {**SWING, **net(64, 64)}, kind=SAC, copies=4),
 }
 
 

@@ -21,6 +21,7 @@ import hyrl_mj
 from hyrl_mj.errors import BadInput
 from hyrl_mj.runs.arcs import policy_start_arcs
 from hyrl_mj.system import progress
+from hyrl_mj.system.streams import Streams
 from hyrl_mj.viz import figures
 
 # A line of the table: the quantity, the paper's value, ours, and a note.
@@ -106,22 +107,13 @@ def overlap(run: hyrl_mj.Run) -> np.ndarray:
     points, both = run.critical_set.points, run.extended_sets.sets[0] & run.extended_sets.sets[1]
     direction = (run.task.noise_in_chart(1.0) > 0).astype(float)
     step = both.grid.cell / 4
-    steps = np.arange(
-        np.ceil(np.subtract(run.task.chart.high, run.task.chart.low).max() / 2 / step)
-    )
+    steps = np.arange(np.ceil(run.task.chart.sides.max() / 2 / step))
     width = np.zeros(len(points))
     for sign in (1, -1):
         z = points[:, None] + (sign * step * steps)[:, None] * direction
         inside = both.contains(z.reshape(-1, z.shape[-1])).reshape(len(points), -1)
         width += step * np.where(inside.all(axis=1), len(steps), inside.argmin(axis=1))
     return width
-
-
-def training(run: hyrl_mj.Run) -> tuple[str, str]:
-    """Returns the samples of stages 6 and 1 as text, and how this differs from the paper."""
-    first, then = run.settings.stage1, run.settings.stage6
-    ours = f"{then.samples:,} a mode ({then.title}), stage 1 {first.samples:,}"
-    return ours, "" if then.warm_start else "ours starts afresh, and trains under noise"
 
 
 # ---- the table
@@ -138,7 +130,10 @@ def common(run: hyrl_mj.Run, horizon: str, width: str, least: float) -> Iterator
     note = SIZED if sized and here < least else ""
     yield "overlap at the replay starts", width, f"{here:.3f} {unit}", note
     yield "overlap where it is narrowest", "> eps", f"{narrowest:.3f} {unit}", ""
-    yield ("cost of step 6 in samples", "at most that of step 1", *training(run))
+    first, then = run.settings.stage1, run.settings.stage6
+    ours = f"{then.samples:,} a mode ({then.title}), stage 1 {first.samples:,}"
+    note = "" if then.warm_start else "ours starts afresh, and trains under noise"
+    yield "cost of step 6 in samples", "at most that of step 1", ours, note
 
 
 def policy_alone(run: hyrl_mj.Run, paper_fates: tuple[str, ...]) -> Iterator[Line]:
@@ -170,12 +165,8 @@ def circle_lines(run: hyrl_mj.Run) -> Iterator[Line]:
     z = np.linspace(0, 2 * np.pi, 10_001)[:, None]
     reward = task.reward(z, np.zeros_like(z))
     low, high = (limit[0] for limit in task.input_limits)
-    yield (
-        "set-point",
-        "(1, 0)",
-        f"({np.cos(task.set_point[0]):g}, {np.sin(task.set_point[0]):g})",
-        "",
-    )
+    (angle,) = task.set_point
+    yield "set-point", "(1, 0)", f"({np.cos(angle):g}, {np.sin(angle):g})", ""
     yield "input u", "[-1, 1] rad/s", f"[{low:g}, {high:g}] rad/s", ""
     yield "reward R", "[-1, 0]", f"[{reward.min():.3g}, {abs(reward.max()):.3g}]", ""
     yield "R(x, y) - R(x, -y)", "0", f"{abs(reward - reward[::-1]).max():.1g}", ""
@@ -225,13 +216,12 @@ def main() -> None:
     circle = opened(options.circle, "unit_circle")
     vehicle = opened(options.vehicle, "vehicle")
     draw(circle, vehicle, options.out)
-    table = Table(title="The paper's values and ours", caption=FOOTNOTE)
-    for heading in ("quantity", "paper", "ours", "note"):
-        table.add_column(heading)
-    for title, lines in (
-        ("unit circle", circle_lines(circle)),
-        ("vehicle", vehicle_lines(vehicle)),
-    ):
+    title = "The paper's values and ours"
+    table = Table("quantity", "paper", "ours", "note", title=title, caption=FOOTNOTE)
+    for title, lines in {
+        "unit circle": circle_lines(circle),
+        "vehicle": vehicle_lines(vehicle),
+    }.items():
         table.add_section()
         table.add_row(f"[bold]{title}")
         for line in lines:
@@ -242,8 +232,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except hyrl_mj.HyrlError as error:
-        print(error, file=sys.stderr)
-        sys.exit(error.exit_status)
+    sys.exit(Streams().run(main))

@@ -16,6 +16,7 @@ from pathlib import Path
 import hyrl_mj
 from hyrl_mj.policies import ALGORITHMS
 from hyrl_mj.runs.sweeps import Row
+from hyrl_mj.system.streams import Streams
 from hyrl_mj.viz import print_sweep
 from hyrl_mj.viz.tables import arrivals
 
@@ -53,8 +54,8 @@ def missed(row: Row, folder: Path) -> Iterator[str]:
             yield f"{row.name}: {name} is {value}, not from {least:g} to {most:g}"
 
 
-def main() -> int:
-    """Runs and prints; returns 1 if a target is missed."""
+def main() -> None:
+    """Runs and prints; ends with status 1 if a target is missed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--tasks", nargs="+", default=list(PAPER), choices=PAPER)
     parser.add_argument("--seeds", nargs="+", type=int, default=list(range(10)))
@@ -73,12 +74,8 @@ def main() -> int:
         print_sweep(result)
         lines += [line for row in result.rows for line in missed(row, folder)]
     print("\n".join(lines) or "every run meets its targets")
-    return int(bool(lines))
+    sys.exit(bool(lines))
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except hyrl_mj.HyrlError as error:
-        print(error, file=sys.stderr)
-        sys.exit(error.exit_status)
+    sys.exit(Streams().run(main))

@@ -33,7 +33,6 @@ EPISODES, FRAMES, SIZE = "60", "2", "480x160"
 # Scripts that have tests of their own; here their options are looked up.
 TESTED = (
     "scripts/benchmark.py",
-    "scripts/field_rows.py",
     "scripts/fields.py",
     "scripts/outside_agents.py",
     "scripts/reproduce_paper.py",

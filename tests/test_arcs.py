@@ -103,7 +103,7 @@ def test_what_cannot_be_shown(run, arguments, message):
 def test_an_arc_of_another_task_is_refused(run, circle, tmp_path):
     (arc,) = noisy_arcs(run, np.array([[0.0, 0.3]]), "none")["policy"]
     other, path = Run(tmp_path, preset(circle, "smoke")), tmp_path / "arcs" / "start0_policy.npz"
-    with other.stage("simulate"):
+    with other.manifest.stage("simulate"):
         arc.save(path)
     with pytest.raises(BadArtifact, match=r"npz is an arc of vehicle, .* a run of unit_circle"):
         other.arc(path)

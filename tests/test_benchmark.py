@@ -33,14 +33,18 @@ def takes(clock, seconds, units):
 def test_a_ratio_is_that_of_the_rates(clock):
     ours, other = takes(clock, 0.5, 10), takes(clock, 2.0, 10)
     found = Figure("walk", "steps/s", "crawl", ">= 3", ours, other).measure(3)
-    assert (found.ours, found.other, found.ratios) == (20.0, 5.0, [4.0, 4.0, 4.0])
+    assert tuple(found[name] for name in ("ours", "other", "ratios")) == (
+        20.0,
+        5.0,
+        [4.0, 4.0, 4.0],
+    )
 
 
 def test_a_time_is_that_of_one_unit(clock):
     ours, other = takes(clock, 0.002, 1), takes(clock, 0.004, 1)
     found = Figure("blink", "ms", "nod", "<= 5 ms", ours, other).measure(1)
-    assert found.ours == pytest.approx(2.0)
-    assert found.ratios == [pytest.approx(2.0)]
+    assert found["ours"] == pytest.approx(2.0)
+    assert found["ratios"] == [pytest.approx(2.0)]
 
 
 def test_the_table_shows_what_was_measured(clock):

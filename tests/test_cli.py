@@ -101,7 +101,7 @@ def test_figures_are_drawn_again(copied):
 def test_a_run_without_a_critical_set_has_one_mode_and_leaves_nothing_of_two(copied):
     run = hyrl_mj.load_run(copied)
     none = replace(run.critical_set, points=np.empty((0, 1)), component=np.zeros(0, dtype=int))
-    with run.stage("critical-set"):
+    with run.manifest.stage("critical-set"):
         none.save(copied / "critical_set.npz")
     again = call("run", "unit_circle", *SMOKE, "--out", copied)
     assert_has_ended(again)

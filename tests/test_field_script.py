@@ -27,7 +27,7 @@ def test_random_fields_have_gaps_and_starts_have_room(script):
         gaps = np.linalg.norm(places[:, None] - places, axis=2) - radii[:, None] - radii
         assert gaps[np.triu_indices(5, 1)].min() >= 0.8
         assert (np.linalg.norm(places - goal, axis=1) - radii).min() >= 0.5
-    z = script["starts_anywhere"](layouts, 3, rng)
+    z = script["starts"](layouts, 3, rng)
     assert z[:, 3].tolist() == np.repeat(range(4), 3).tolist()
     away = np.linalg.norm(layouts.tracks[z[:, 3].astype(int), 0] - z[:, None, :2], axis=2)
     assert (away - layouts.radii[z[:, 3].astype(int)]).min() >= 0.3
@@ -73,19 +73,17 @@ def test_outcomes_are_counted(script):
     task = Driving(hyrl_mj.get_task("field"), layouts, time=5.0, starts=z)
     tally = script["Tally"]()
     script["drive"](task, Ahead(), z, None, tally)
-    assert tally.outcomes == {"crashed": 1, "reached": 1, "stalled": 1}
+    assert sorted(tally.outcomes) == ["crashed", "reached", "stalled"]
     assert tally.row()[:3] == ["3", "1", "1"]
 
 
-def test_the_rows_lack_what_their_names_say(script, monkeypatch):
-    monkeypatch.syspath_prepend(SCRIPT.parent)
-    rows_of = runpy.run_path(str(SCRIPT.with_name("field_rows.py")))["rows_of"]
+def test_the_rows_lack_what_their_names_say(script):
     task = hyrl_mj.get_task("field")
     layouts = script["drawn"](np.random.default_rng(0), 4, 2, moving=False)
     ahead = SimpleNamespace(inputs=lambda observed: np.tile([1.0, 0.0], (len(observed), 1)))
     settings, policies = SimpleNamespace(eps=0.1), dict.fromkeys((LEFT, RIGHT), ahead)
     run = SimpleNamespace(settings=settings, policy=ahead, mode_policies=policies)
-    loops = rows_of(run, Driving(task, layouts), seed=0)
+    loops = script["rows_of"](run, Driving(task, layouts), seed=0)
     # 0.15 m in front of the first post of the first field, with the face to it.
     post, radius = layouts.tracks[0, 0, 0], layouts.radii[0, 0]
     pose = np.array([[post[0] - radius - 0.25, post[1], 0.0]])

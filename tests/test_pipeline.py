@@ -81,7 +81,7 @@ def test_a_newer_file_with_the_same_content_changes_nothing(run, name):
 def test_another_result_makes_those_that_were_made_from_it_out_of_date(run):
     other = replace(run.critical_set, points=run.critical_set.points + 0.01)
     before = stages_done(run)
-    with run.stage("critical-set"):
+    with run.manifest.stage("critical-set"):
         other.save(run.path / "critical_set.npz")
     # Extended sets and mode policies of this run are planted: they were made from nothing.
     built = ["robustness", "simulate", "figures", "report"]

@@ -68,22 +68,22 @@ def plant(path, task, critical, partition, slack=0.2, **settings):
     """All but what noise can do, the replays and the video."""
     run = Run(path, replace(preset(task, "smoke"), **settings))
     write_config(run)
-    with run.stage("train"):
+    with run.manifest.stage("train"):
         linear(task, 0.0).save(path / "policy.safetensors")
         Arrivals(990, 0, 1_000).save(path / "arrivals.json")
-    with run.stage("critical-set"):
+    with run.manifest.stage("critical-set"):
         critical.save(path / "critical_set.npz")
-    with run.stage("partition"):
+    with run.manifest.stage("partition"):
         partition.save(path / "partition.npz")
     grid = partition.grid
-    with run.stage("extended-sets"):
+    with run.manifest.stage("extended-sets"):
         ExtendedSets(
             partition.modes,
             tuple(GridSet(grid, part.values - slack) for part in partition.parts),
             tuple(np.ones(len(grid.nodes), dtype=bool) for _ in partition.parts),
             0.3, 0.1, np.empty((0, task.chart.dimension)), np.empty(0),
         ).save(path / "extended_sets.npz")  # fmt: skip
-    with run.stage("retrain"):
+    with run.manifest.stage("retrain"):
         for q in partition.modes:
             linear(task, 0.3 - 0.6 * q).save(path / f"mode_{q}.safetensors")
         results = tuple(ModeResult(q, 1.0, 1) for q in partition.modes)
@@ -95,7 +95,7 @@ def film(path):
     """A replay and its poster: magenta on the left, green on the right."""
     frame = np.full((POSTER[1], POSTER[0], 3), MAGENTA, dtype=np.uint8)
     frame[:, POSTER[0] // 2 :] = GREEN
-    with load_run(path).stage("replay"):
+    with load_run(path).manifest.stage("replay"):
         with video(path / "replay.mp4", *POSTER, 10) as add:
             for _ in range(5):
                 add(frame)

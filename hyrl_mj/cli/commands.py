@@ -64,44 +64,57 @@ def run(task: str | None = None, *, environment: EnvironmentOptions, options: Ru
         finish(pipeline.run(chosen, options))
 
 
-def robustify(
-    task: str | None = None,
-    *,
-    policy: Path | None = None,
-    environment: EnvironmentOptions,
-    options: AgentOptions,
-) -> None:
-    """Make an agent robust that was trained elsewhere: all stages but the first.
+def agent_command(
+    name: str, help_text: str, work: Callable[[Task, AnyPolicy, AgentOptions], object]
+) -> Callable[..., None]:
+    """Returns the subcommand that does some work with an agent that was trained elsewhere."""
 
-    An existing run directory is resumed: only what is missing is done.
+    def command(
+        task: str | None = None,
+        *,
+        policy: Path | None = None,
+        environment: EnvironmentOptions,
+        options: AgentOptions,
+    ) -> None:
+        agent = None
+        if policy is not None and not environment.explain:
+            agent = agent_at(policy)  # said before an environment is tried out, which takes longer
+        chosen = chosen_task(task, environment)
+        if environment.explain:
+            print(explained(chosen))
+        elif agent is None:
+            raise BadInput(
+                f"{name} needs --policy: the agent, a .zip, .onnx or .safetensors file, or module:object"
+            )
+        else:
+            work(chosen, agent, options)
 
-    The verdict is PROVED, WON, HELD, UNDECIDED, WEAK, or FAILED (exit status 1).
+    command.__doc__ = f"""{help_text}
 
     Args:
         task: a task, see `hyrl-mj list`, or a Python file that defines one; by default none, with --env.
         policy: the agent, a .zip that SB3's model.save wrote, an .onnx file, a .safetensors file, or Python
             code as module:object, which is imported; by default none, with --explain.
     """
-    if given := given_agent("robustify", task, policy, environment):
-        finish(pipeline.robustify(*given, options))
+    return command
 
 
-def given_agent(
-    command: str, task: str | None, policy: Path | None, environment: EnvironmentOptions
-) -> tuple[Task, AnyPolicy] | None:
-    """Returns the task and the agent of a command; None if it only explains an environment."""
-    agent = None
-    if policy is not None and not environment.explain:
-        agent = agent_at(policy)  # said before an environment is tried out, which takes longer
-    chosen = chosen_task(task, environment)
-    if environment.explain:
-        print(explained(chosen))
-        return None
-    if agent is None:
-        raise BadInput(
-            f"{command} needs --policy: the agent, a .zip, .onnx or .safetensors file, or module:object"
-        )
-    return chosen, agent
+robustify = agent_command(
+    "robustify",
+    """Make an agent robust that was trained elsewhere: all stages but the first.
+
+    An existing run directory is resumed: only what is missing is done.
+
+    The verdict is PROVED, WON, HELD, UNDECIDED, WEAK, or FAILED (exit status 1).""",
+    lambda *given: finish(pipeline.robustify(*given)),
+)
+diagnose = agent_command(
+    "diagnose",
+    """Find out what noise can do to an agent: critical set, losses, margin.
+
+    Nothing is trained; `hyrl-mj robustify` continues in the same run directory.""",
+    lambda *given: pipeline.diagnose(*given),
+)
 
 
 def finish(run: Run) -> None:
@@ -134,26 +147,6 @@ def sweep(
     print(f"tables in {folder}/sweep.html, sweep.csv and sweep.json")
     if any(not row.done or row.verdict == Word.FAILED for row in result.rows):
         raise SystemExit(1)
-
-
-def diagnose(
-    task: str | None = None,
-    *,
-    policy: Path | None = None,
-    environment: EnvironmentOptions,
-    options: AgentOptions,
-) -> None:
-    """Find out what noise can do to an agent: critical set, losses, margin.
-
-    Nothing is trained; `hyrl-mj robustify` continues in the same run directory.
-
-    Args:
-        task: a task, see `hyrl-mj list`, or a Python file that defines one; by default none, with --env.
-        policy: the agent, a .zip that SB3's model.save wrote, an .onnx file, a .safetensors file, or Python
-            code as module:object, which is imported; by default none, with --explain.
-    """
-    if given := given_agent("diagnose", task, policy, environment):
-        pipeline.diagnose(*given, options)
 
 
 def stage_command(name: str, help_text: str) -> Callable[..., None]:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from hyrl_mj.errors import BadInput, brief, unknown
+from hyrl_mj.files import artifacts
 from hyrl_mj.tasks import Layouts, wrapped
 
 # How far from the origin anything may be, and the largest radius [m]; the longest run and time between two
@@ -126,28 +127,15 @@ def _content(path: Path) -> Any:
                 raise BadInput(f"{path} has the key {name[:SHOWN]!r} twice in a row: give it once")
         return dict(pairs)
 
-    largest = 2**22  # [bytes]
-    if path.exists() and not path.is_file():
-        raise BadInput(f"{path} is no file: give the JSON file of a field")
-    try:
-        with path.open("rb") as file:
-            content = file.read(largest + 1)
-    except (OSError, ValueError) as error:
-        why = getattr(error, "strerror", None) or error
-        raise BadInput(f"{path} cannot be read ({why}): give the JSON file of a field") from None
-    if len(content) > largest:
-        raise BadInput(
-            f"{path} is larger than {largest / 2**20:g} MiB: give a JSON file of a field, with at most "
-            f"{MOST_POSTS} posts"
-        )
+    needed = "give the JSON file of a field"
+    fewer = f"give a JSON file of a field, with at most {MOST_POSTS} posts"
+    content = artifacts.read_given(path, needed, smaller=fewer)
     try:
         return json.loads(content.decode(), object_pairs_hook=once)
     except BadInput:
         raise
     except (ValueError, RecursionError) as error:
-        raise BadInput(
-            f"{path} is not JSON ({brief(error)}): give the JSON file of a field"
-        ) from None
+        raise BadInput(f"{path} is not JSON ({brief(error)}): {needed}") from None
 
 
 @dataclass(frozen=True)

@@ -63,13 +63,18 @@ def replacing(path: Path) -> Iterator[Path]:
     except BrokenPipeError:  # the program that writes the file has died
         raise
     except OSError as error:
-        raise BadInput(
-            f"{path} cannot be written ({error.strerror or error}): give a place that can be written "
-            "and has room"
-        ) from error
+        raise not_writable(path, error) from error
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def not_writable(path: Path, error: OSError) -> BadInput:
+    """Returns the error for a file or a folder that cannot be written."""
+    why = error.strerror or error
+    return BadInput(
+        f"{path} cannot be written ({why}): give a place that can be written and has room"
+    )
 
 
 @contextmanager
@@ -101,6 +106,27 @@ def read_limited(path: Path, limit: int = LARGEST) -> bytes:
     with path.open("rb") as file:
         content = file.read(limit + 1)
     check_size(len(content), limit)
+    return content
+
+
+def read_given(
+    path: Path, remedy: str, limit: int = LARGEST_JSON, smaller: str | None = None
+) -> bytes:
+    """Returns the content of a file that the user has named, if it is no longer than the limit [bytes].
+
+    Raises:
+        BadInput: it cannot be read; the message ends with the remedy, or says how to make it smaller.
+    """
+    if path.exists() and not path.is_file():
+        raise BadInput(f"{path} is no file: {remedy}")
+    try:
+        with path.open("rb") as file:
+            content = file.read(limit + 1)
+    except (OSError, ValueError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise BadInput(f"{path} cannot be read ({why}): {remedy}") from None
+    if len(content) > limit:
+        raise BadInput(f"{path} is larger than {limit / 2**20:g} MiB: {smaller or remedy}")
     return content
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from hyrl_mj.errors import BadInput, brief, has_controls
+from hyrl_mj.files import artifacts
 
 LARGEST = 2**26  # [bytes]: a million rows of six columns
 NEEDED = "give a CSV file with a line of names and a row for each sample"
@@ -64,20 +65,9 @@ class Log:
 
 
 def _text(path: Path) -> str:
-    if path.exists() and not path.is_file():
-        raise BadInput(f"{path} is no file: {NEEDED}")
+    fewer = "give fewer rows, or only the columns that are needed"
     try:
-        with path.open("rb") as file:
-            content = file.read(LARGEST + 1)
-    except (OSError, ValueError) as error:
-        why = getattr(error, "strerror", None) or error
-        raise BadInput(f"{path} cannot be read ({why}): {NEEDED}") from None
-    if len(content) > LARGEST:
-        raise BadInput(
-            f"{path} is larger than {LARGEST >> 20} MiB: give fewer rows, or only the columns that are needed"
-        )
-    try:
-        text = content.decode("utf-8-sig")
+        text = artifacts.read_given(path, NEEDED, LARGEST, fewer).decode("utf-8-sig")
     except UnicodeDecodeError:
         text = "\0"
     if "\0" in text:

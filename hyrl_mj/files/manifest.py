@@ -288,10 +288,7 @@ def locked(folder: Path) -> Iterator[None]:
             "folder"
         ) from None
     except OSError as error:
-        raise BadInput(
-            f"{folder} cannot be written ({error.strerror or error}): give a place that can be "
-            "written and has room"
-        ) from error
+        raise artifacts.not_writable(folder, error) from error
     try:
         if lock.lock_counter == 1:
             since = time.strftime("%Y-%m-%d %H:%M:%S")

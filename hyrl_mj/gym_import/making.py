@@ -333,13 +333,9 @@ _INSTEAD = {
 
 
 def _arguments(path: Path) -> dict[str, Any]:
-    if path.exists() and not path.is_file():
-        raise BadInput(f"{path} is no file: give a JSON file")
+    text = artifacts.read_given(path, "give a JSON file")
     try:
-        text = artifacts.read_limited(path, artifacts.LARGEST_JSON).decode()
-        content = json.loads(text, object_hook=with_arrays)
-    except OSError as error:
-        raise BadInput(f"{path} cannot be read ({error.strerror}): give a JSON file") from None
+        content = json.loads(text.decode(), object_hook=with_arrays)
     except (ValueError, RecursionError) as error:
         raise BadInput(f"{path} is no JSON ({brief(error)}): give a JSON file") from None
     if not isinstance(content, dict):

@@ -200,7 +200,7 @@ def extend_again(run: Run, horizon: float, say: Say = print) -> Run:
     """Runs stages 4 and 5 with another horizon T [s], and writes T to `config.json` if they succeed."""
     changed = Run(run.path, replace(run.settings, horizon=horizon), run.function)
     with locked(run.path):
-        with changed.stage("extended-sets"):
+        with changed.manifest.stage("extended-sets"):
             extended_sets_stage(changed, lambda text: say(f"extended-sets: {text}"))
         write_config(changed, run.versions)
     say(f"go on with {beginning(changed, run.path)}")
@@ -289,7 +289,7 @@ def _with_agent(task: str | Path | Task, policy: AnyPolicy, options: AgentOption
     path = options.out or Path("runs") / f"{checked.name}_robust"
     with opened(path, settings, function) as run:
         if not run.manifest.is_done("train"):
-            with run.stage("train"):
+            with run.manifest.stage("train"):
                 arrivals = Arrivals.measure(checked, external.policy)
                 external.store(run.path)
                 arrivals.save(run.path / "arrivals.json")

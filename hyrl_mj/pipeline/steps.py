@@ -337,6 +337,6 @@ def as_stage(run: Run, name: str, work: Callable[[Run], object]) -> Run:
     """
     fresh = replace(run)  # it reads every file anew, so that the manifest records what was read
     # The physics uses all cores: BLAS threads would only wait for them.
-    with threadpool_limits(1, user_api="blas"), fresh.stage(name):
+    with threadpool_limits(1, user_api="blas"), fresh.manifest.stage(name):
         work(fresh)
     return replace(run)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import platform
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from hashlib import sha256
@@ -79,7 +79,11 @@ class Run:
 
     @cached_property
     def manifest(self) -> Manifest:
-        """The record of the stages that are finished."""
+        """The record of the stages that are finished.
+
+        In its block `stage` a stage reads its inputs from this run, and writes its files. A run remembers
+        what it has read, so a stage takes a run of its own.
+        """
         return Manifest(self.path, self.digests, self.task.code)
 
     @property
@@ -90,13 +94,6 @@ class Run:
         last = {stage: values | {"horizon": None} for stage in FILES} | {"extended-sets": values}
         texts = {stage: json.dumps(v, sort_keys=True, default=str) for stage, v in last.items()}
         return {name: sha256(text.encode()).hexdigest() for name, text in texts.items()}
-
-    def stage(self, name: str) -> AbstractContextManager[None]:
-        """Returns the block in which a stage reads its inputs from this run, and writes its files.
-
-        A run remembers what it has read, so a stage takes a run of its own.
-        """
-        return self.manifest.stage(name)
 
     @property
     def agent(self) -> Agent | None:

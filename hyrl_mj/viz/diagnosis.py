@@ -11,7 +11,7 @@ from hyrl_mj.simulation import HybridArc
 from hyrl_mj.viz.commands import beginning
 from hyrl_mj.viz.options import ReplayOptions
 from hyrl_mj.viz.replay import Show, render_replay
-from hyrl_mj.viz.report import fill, film, pictures, write
+from hyrl_mj.viz.report import about, fill, film, pictures, write
 from hyrl_mj.viz.shows import replay_floor
 
 # In the run directory: the page, and the folder with its pictures and data.
@@ -46,8 +46,8 @@ def write_page(run: Run, robustness: Robustness, arc: HybridArc | None, results:
     folder = run.path / FOLDER
     text = fill(
         "diagnosis.html",
-        run,
-        robustness,
+        run.path,
+        **about(run, robustness),
         sentences=results,
         arc=arc,
         video=film(folder / "worst.mp4"),

@@ -33,19 +33,8 @@ from hyrl_mj.viz.terminal import print_table
 SHOWN = ("policy", "hyrl")
 
 
-def drive_tables(drives: Drives, noise: str, seed: int) -> list[Table]:
-    """Returns how the runs ended, a row for each start; under the worst noise, too, if it was looked for."""
-    what = counted(drives.task.layouts.posts, "post")
-    named = "no noise" if noise == "none" else f"{noise} noise of {drives.bounds}"
-    near = f"arrived: within {drives.task.reached:g} m of the goal"
-    tables = [_table(drives, drives.arcs, f"{what}: {named}, seed {seed}; {near}")]
-    if drives.attacked:
-        title = f"{what}: the worst noise of up to {drives.bounds} that a search found for each"
-        tables.append(_table(drives, drives.attacked, title))
-    return tables
-
-
 def _table(drives: Drives, arcs: Mapping[str, Sequence[HybridArc]], title: str) -> Table:
+    """Returns how the runs ended, a row for each start."""
     task, rows = drives.task, []
     for number, (policy, hyrl) in enumerate(zip(*(arcs[n] for n in SHOWN), strict=True)):
         x, y, heading = hyrl.z[0]
@@ -76,22 +65,6 @@ def _arrivals(drives: Drives, arcs: Mapping[str, Sequence[HybridArc]]) -> str:
         f"RL policy arrives from {counts[0]}, HyRL from {counts[1]}, and HyRL from {counts[2]} if its modes "
         "drive by a law without learning"
     )
-
-
-def drive_shows(drives: Drives, title: str, starts: Sequence[int] | None = None) -> list[Show]:
-    """Returns a show of each start, under the worst noise if it was looked for.
-
-    Args:
-        drives: what is shown.
-        title: of the policy, as "RL policy (PPO)".
-        starts: numbers of the starts, by default all.
-    """
-    arcs = drives.attacked or drives.arcs
-    count = len(arcs["hyrl"])
-    return [
-        Show([arcs["policy"][i]], [arcs["hyrl"][i]], f"{title}, start {i}")
-        for i in (range(count) if starts is None else starts)
-    ]
 
 
 def drive_run(
@@ -129,17 +102,33 @@ def drive_run(
     check_passable(field, local.body)
     if out is not None:
         check_replay(local, out, how)
-        _check_shown(shown, len(field.starts))
+    starts = range(len(field.starts)) if shown is None else shown
+    for number in starts:
+        if number >= len(field.starts):
+            raise BadInput(
+                f"--shown {number}: the file has no such start, give numbers from 0 to "
+                f"{len(field.starts) - 1}"
+            )
     made_for = run.settings.eps
     for caution in (*cautions(field, local.body), *noise_cautions(local, made_for, options)):
         logging.getLogger("hyrl_mj").warning("warning: %s", printable(caution))
     drives = drive(local, policy, policies, made_for, field, options, run.settings.attack)
-    for table in drive_tables(drives, options.noise, options.seed):
-        print_table(table)
+    what, seed = counted(drives.task.layouts.posts, "post"), options.seed
+    noise = "no noise" if options.noise == "none" else f"{options.noise} noise of {drives.bounds}"
+    near = f"arrived: within {drives.task.reached:g} m of the goal"
+    print_table(_table(drives, drives.arcs, f"{what}: {noise}, seed {seed}; {near}"))
+    if drives.attacked:
+        worst = f"the worst noise of up to {drives.bounds} that a search found for each"
+        print_table(_table(drives, drives.attacked, f"{what}: {worst}"))
     for sentence in drive_sentences(drives):
         print(sentence)
     if out is not None:
-        render_replay(drives.task, drive_shows(drives, run.policy_title, shown), out, how)
+        policy_arcs, hybrid_arcs = ((drives.attacked or drives.arcs)[name] for name in SHOWN)
+        shows = [
+            Show([policy_arcs[i]], [hybrid_arcs[i]], f"{run.policy_title}, start {i}")
+            for i in starts
+        ]
+        render_replay(drives.task, shows, out, how)
         print(f"{'picture' if out.suffix == '.png' else 'video'} at {out}")
     return drives
 
@@ -167,12 +156,3 @@ def _parts(run: Run) -> tuple[Field, MlpPolicy, Mapping[int, MlpPolicy]]:
             f"right: {remedy}, perhaps with another --seed"
         )
     return local, policy, policies
-
-
-def _check_shown(shown: Sequence[int] | None, starts: int) -> None:
-    """Raises `BadInput` unless these are numbers of starts."""
-    for number in shown or ():
-        if number >= starts:
-            raise BadInput(
-                f"--shown {number}: the file has no such start, give numbers from 0 to {starts - 1}"
-            )

@@ -67,8 +67,8 @@ def render(run: Run) -> str:
     first, sixth = (_texts(vars(s) | more) for s, more in zip(stages, options, strict=True))
     return fill(
         "report.html",
-        run,
-        robustness,
+        run.path,
+        **about(run, robustness),
         modes=[task.mode_name(q) for q in run.controller.modes],
         listed=listed,
         worst=task.noise_on(bool(robustness and robustness.everywhere)),
@@ -158,35 +158,34 @@ def write(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
-def fill(template: str, run: Run, robustness: Robustness | None, **values: Any) -> str:
-    """Returns a page from its template, with the values that every page of a run shows."""
-    page = environment().get_template(template)
-    return page.render(
-        # A name that is not Unicode must not keep the page from being written.
-        name=os.fsencode(run.path.resolve().name).decode("utf-8", "replace"),
-        title=task_title(run.task),
-        run=run,
-        task=run.task,
-        settings=run.settings,
-        critical=run.critical_set,
-        unit=run.task.noise_on()[1],
-        tables=tables,
-        robustness=robustness,
-        game=robustness.game if robustness else None,
-        episodes=robustness.episodes if robustness else (),
-        **values,
-    )
-
-
-def environment() -> Environment:
-    """Returns the environment of all templates, which escapes what it fills in."""
-    return Environment(
+def fill(template: str, folder: Path, **values: Any) -> str:
+    """Returns a page from its template, which escapes what it fills in."""
+    environment = Environment(
         loader=PackageLoader("hyrl_mj.viz"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    # A name that is not Unicode must not keep the page from being written.
+    name = os.fsencode(folder.resolve().name).decode("utf-8", "replace")
+    return environment.get_template(template).render(name=name, **values)
+
+
+def about(run: Run, robustness: Robustness | None) -> dict[str, Any]:
+    """Returns the values that every page of a run shows."""
+    return {
+        "title": task_title(run.task),
+        "run": run,
+        "task": run.task,
+        "settings": run.settings,
+        "critical": run.critical_set,
+        "unit": run.task.noise_on()[1],
+        "tables": tables,
+        "robustness": robustness,
+        "game": robustness.game if robustness else None,
+        "episodes": robustness.episodes if robustness else (),
+    }
 
 
 def film(path: Path, has: Callable[[Path], bool] = Path.is_file) -> Picture | None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import os
+from collections.abc import Iterator
 from io import BytesIO
+from itertools import chain
 from pathlib import Path
 from urllib.parse import quote
 
@@ -19,31 +20,27 @@ from hyrl_mj.runs.improvement import LEAST_SEEDS, profile
 from hyrl_mj.runs.sweeps import Row, Setting, Sweep
 from hyrl_mj.viz import colours, sweep_tables as tables
 from hyrl_mj.viz.figures import style
-from hyrl_mj.viz.report import Picture, data_uri, environment, write
+from hyrl_mj.viz.report import Picture, data_uri, fill, write
 
 
 def write_page(sweep: Sweep, folder: Path) -> None:
     """Writes `sweep.html` into the folder of a sweep."""
     groups = sweep.groups()
-    page = (
-        environment()
-        .get_template("sweep.html")
-        .render(
-            # A name that is not Unicode must not keep the page from being written.
-            name=os.fsencode(folder.resolve().name).decode("utf-8", "replace"),
-            common=sweep.common,
-            summary=(summary := tables.summary_table(sweep)),
-            markdown=tables.markdown(summary),
-            improved=tables.improvement_table(sweep),
-            pictures=[p for p in (_picture(groups, folder), _profiles(sweep)) if p is not None],
-            groups=[
-                (setting, tables.run_table(rows), _links(rows), tables.worst(rows))
-                for setting, rows in groups.items()
-            ],
-            open_rows=[row for row in sweep.rows if not row.done],
-            done=sum(row.done for row in sweep.rows),
-            total=len(sweep.rows),
-        )
+    page = fill(
+        "sweep.html",
+        folder,
+        common=sweep.common,
+        summary=(summary := tables.summary_table(sweep)),
+        markdown=tables.markdown(summary),
+        improved=tables.improvement_table(sweep),
+        pictures=[*_pictures(sweep, folder)],
+        groups=[
+            (setting, tables.run_table(rows), _links(rows), tables.worst(rows))
+            for setting, rows in groups.items()
+        ],
+        open_rows=[row for row in sweep.rows if not row.done],
+        done=sum(row.done for row in sweep.rows),
+        total=len(sweep.rows),
     )
     write(folder / "sweep.html", page)
 
@@ -53,21 +50,27 @@ def _links(rows: list[Row]) -> dict[str, str]:
     return {row.name: f"{quote(row.name)}/report.html" for row in rows if row.done}
 
 
-def _picture(groups: dict[Setting, list[Row]], folder: Path) -> Picture | None:
-    """Returns the curves of all settings, or None where the worst-case game was not played."""
+def _pictures(sweep: Sweep, folder: Path) -> Iterator[Picture]:
+    """Yields the curves of settings for which the worst-case game was played, and profiles of many runs."""
     curves: dict[Setting, list[Curve]] = {}
-    for setting, rows in groups.items():
-        for row in rows:
-            game = load_run(folder / row.name).robustness.deciding if row.done else None
-            if game is not None:
-                curves.setdefault(setting, []).append(game.curve)
-    if not curves:
-        return None
-    caption = (
-        "What is won of the winnable starts against the worst noise of up to a bound: the line is the median "
-        "over the seeds, the band reaches from the least to the greatest."
-    )
-    return _as_picture("curves", draw_curves(curves), caption)
+    for row in chain.from_iterable(sweep.groups().values()):
+        game = load_run(folder / row.name).robustness.deciding if row.done else None
+        if game is not None:
+            curves.setdefault(row.setting, []).append(game.curve)
+    if curves:
+        yield _as_picture(
+            "curves",
+            draw_curves(curves),
+            "What is won of the winnable starts against the worst noise of up to a bound: the line is the "
+            "median over the seeds, the band reaches from the least to the greatest.",
+        )
+    if (profiles := draw_profiles(sweep)) is not None:
+        yield _as_picture(
+            "profiles",
+            profiles,
+            "Performance profiles: the share of the runs of the sweep, over all settings and seeds, in which "
+            "a controller wins at least so much.",
+        )
 
 
 def _as_picture(name: str, figure: Figure, caption: str) -> Picture:
@@ -76,18 +79,6 @@ def _as_picture(name: str, figure: Figure, caption: str) -> Picture:
     with Image.open(content) as image:
         size = image.size
     return Picture(name, data_uri(content.getvalue(), "image/png"), *size, caption)
-
-
-def _profiles(sweep: Sweep) -> Picture | None:
-    """Returns the performance profiles of both controllers, or None with fewer than three runs."""
-    figure = draw_profiles(sweep)
-    if figure is None:
-        return None
-    caption = (
-        "Performance profiles: the share of the runs of the sweep, over all settings and seeds, in which a "
-        "controller wins at least so much."
-    )
-    return _as_picture("profiles", figure, caption)
 
 
 def draw_profiles(sweep: Sweep) -> Figure | None:

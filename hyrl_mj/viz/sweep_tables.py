@@ -114,12 +114,17 @@ def improvement_table(sweep: Sweep) -> Table | None:
     for one in found:
         heading, show = FIGURES[one.figure]
         signed = (lambda v: f"{v:+.3g}") if show is _number else (lambda v: f"{100 * v:+.2f}%")
-        cells = [_with_interval(one.policy, show), _with_interval(one.hyrl, show)]
-        rows.append([heading, f"{one.runs}", *cells, _with_interval(one.difference, signed)])
-        rows[-1].append(f"{one.better:.2f}")
+        row = {
+            "figure": heading,
+            "runs": f"{one.runs}",
+            "RL policy": _with_interval(one.policy, show),
+            "HyRL": _with_interval(one.hyrl, show),
+            "difference": _with_interval(one.difference, signed),
+            "probability of improvement": f"{one.better:.2f}",
+        }
+        rows.append(row)
     title = "HyRL against the RL policy: means, 95% intervals (bootstrap over seeds and starts)"
-    headings = ("figure", "runs", "RL policy", "HyRL", "difference", "probability of improvement")
-    return Table(title, headings, rows)
+    return Table.of(title, rows)
 
 
 def _with_interval(mean: Mean, show: Callable[[float], str]) -> str:
@@ -136,17 +141,14 @@ def _verdicts(group: list[Row]) -> str:
 
 def run_table(group: Iterable[Row]) -> Table:
     """Returns the figures of each run of a setting."""
-    group = [*group]
-    names = shown(group)
-    rows = []
+    group, rows = [*group], []
     for row in group:
-        values = [row.figures.get(name) for name in names]
-        cells = [
-            "-" if v is None else COLUMNS[n].show(v) for n, v in zip(names, values, strict=True)
-        ]
-        rows.append([str(row.seed), row.verdict or row.state, *cells, f"{row.seconds:.0f} s"])
-    headings = ["seed", "verdict", *(COLUMNS[name].heading for name in names), "time"]
-    return Table(group[0].setting.title, headings, rows)
+        cells = {"seed": f"{row.seed}", "verdict": row.verdict or row.state}
+        for name in shown(group):
+            value, column = row.figures.get(name), COLUMNS[name]
+            cells[column.heading] = "-" if value is None else column.show(value)
+        rows.append(cells | {"time": f"{row.seconds:.0f} s"})
+    return Table.of(group[0].setting.title, rows)
 
 
 def worst(group: Iterable[Row]) -> Row | None:

@@ -51,6 +51,11 @@ class Table:
     headings: Sequence[str]
     rows: Sequence[Sequence[str | Ending]]
 
+    @staticmethod
+    def of(title: str, rows: Sequence[Mapping[str, str]]) -> Table:
+        """Returns a table of rows that have the same headings, at least one."""
+        return Table(title, list(rows[0]), [list(row.values()) for row in rows])
+
 
 Arcs = Mapping[tuple[str, str], HybridArc]
 
@@ -105,30 +110,31 @@ def replay_sentence(run: Run, arcs: Arcs) -> str:
 def score_table(task: Task, game: GameResult) -> Table:
     """Returns the scores of the worst-case game: a row for each noise bound and controller."""
     where, unit = task.noise_on(game.everywhere)
-    headings = [f"noise on {where} [{unit}]", "open", "winnable", "controller"]
-    headings += ["proved, own q0", "not broken, own q0", "proved, any q0", "not broken, any q0"]
-    if game.lasting:
-        headings += ["latest arrival, own q0", "latest, any q0", f"excursion [{unit}]"]
     rows = []
     for level in zip(*game.scores.values(), strict=True):
         for who, score in zip(game.scores, level, strict=True):
-            row = [f"{score.eps:g}", percent(score.open), percent(score.winnable), NAMES[who]]
-            for proved, whole in (
-                (score.proved, score.not_broken),
-                (score.proved_any, score.not_broken_any),
+            row = {
+                f"noise on {where} [{unit}]": f"{score.eps:g}",
+                "open": percent(score.open),
+                "winnable": percent(score.winnable),
+                "controller": NAMES[who],
+            }
+            for q0, proved, whole in (
+                ("own q0", score.proved, score.not_broken),
+                ("any q0", score.proved_any, score.not_broken_any),
             ):
                 known = percent(whole, surely=proved == 1)
-                if who == LIMIT and whole == 1:
-                    known = "all"
-                row += [proved_text(proved), known]
+                row[f"proved, {q0}"] = proved_text(proved)
+                row[f"not broken, {q0}"] = "all" if who == LIMIT and whole == 1 else known
             if game.lasting:
-                times = (score.time, score.proved_time), (score.time_any, score.proved_time_any)
-                for (time, bound), won in zip(times, (score.won, score.won_any), strict=True):
-                    row.append(_seconds(bound or time, won))
-                row.append(excursion_text(None if who == LIMIT else score.excursion))
+                own, some = score.proved_time or score.time, score.proved_time_any or score.time_any
+                row["latest arrival, own q0"] = f"{own:.2f} s" if score.won else "-"
+                row["latest, any q0"] = f"{some:.2f} s" if score.won_any else "-"
+                excursion = None if who == LIMIT else score.excursion
+                row[f"excursion [{unit}]"] = excursion_text(excursion)
             rows.append(row)
     estimated = ", an estimate" if game.estimate else ""
-    return Table(f"{task.name}: worst case over all noise signals{estimated}", headings, rows)
+    return Table.of(f"{task.name}: worst case over all noise signals{estimated}", rows)
 
 
 def proved_text(share: float | None) -> str:
@@ -140,19 +146,18 @@ def margin_table(task: Task, game: GameResult) -> Table:
     """Returns the margins, and how far off runs end without noise: a row for each controller."""
     _, unit = task.noise_on(game.everywhere)
     units = ", ".join(dict.fromkeys(task.chart.units))
-    off = f"off the set-point at most, no noise [{units}]"
     rows = [
-        [
-            NAMES[who],
-            margin_text(margin, unit),
-            margin_text(game.proved_margin[who], unit),
-            f"{game.miss_without_noise[who]:.3f}",
-        ]
+        {
+            "controller": NAMES[who],
+            "no node is lost up to noise": margin_text(margin, unit),
+            f"{100 * NEARLY:.0f}% is proved up to noise": margin_text(
+                game.proved_margin[who], unit
+            ),
+            f"off the set-point at most, no noise [{units}]": f"{game.miss_without_noise[who]:.3f}",
+        }
         for who, margin in game.margin.items()
     ]
-    nearly = f"{100 * NEARLY:.0f}%"
-    headings = ["controller", "no node is lost up to noise", f"{nearly} is proved up to noise", off]
-    return Table(f"{task.name}: margins", headings, rows)
+    return Table.of(f"{task.name}: margins", rows)
 
 
 def excursion_text(excursion: float | None) -> str:
@@ -165,17 +170,23 @@ def replays_table(task: Task, counts: Sequence[ReplayCount]) -> Table:
     kinds = list(dict.fromkeys(kind for count in counts for kind in count.starts))
     rows = []
     for c in counts:
-        row = [NAMES[c.controller], c.of, f"{c.played:,}", f"{c.failures:,}"]
-        row += [f"{c.lost[k]:,} of {c.starts[k]:,}" if k in c.starts else "-" for k in kinds]
-        lost = "-"
+        row = {
+            "controller": NAMES[c.controller],
+            "starts": c.of,
+            "played": f"{c.played:,}",
+            "lost": f"{c.failures:,}",
+        }
+        for k in kinds:
+            row[f"lost, {k}"] = f"{c.lost[k]:,} of {c.starts[k]:,}" if k in c.starts else "-"
+        row |= {"judged": f"{c.judged:,}", "first lost": "-"}
         if first := c.first:
             mode = "" if first.q0 is None else f", mode {task.mode_name(first.q0)}"
-            lost = f"{first.outcome.replace('_', ' ')} from {_point(np.array(first.start))}{mode}"
-        rows.append([*row, f"{c.judged:,}", lost])
-    headings = ["controller", "starts", "played", "lost", *(f"lost, {kind}" for kind in kinds)]
+            where = f"{_point(np.array(first.start))}{mode}"
+            row["first lost"] = f"{first.outcome.replace('_', ' ')} from {where}"
+        rows.append(row)
     where, unit = task.noise_on(counts[0].everywhere)
     title = f"{task.name}: replays in MuJoCo, noise on {where} of up to {counts[0].eps:g} {unit}"
-    return Table(title, [*headings, "judged", "first lost"], rows)
+    return Table.of(title, rows)
 
 
 def episode_table(task: Task, counts: Sequence[EpisodeCount]) -> Table:
@@ -184,16 +195,17 @@ def episode_table(task: Task, counts: Sequence[EpisodeCount]) -> Table:
     for c in counts:
         (low, high), (_, unit) = c.interval, task.noise_on(c.everywhere)
         outcomes = ", ".join(f"{k.replace('_', ' ')} {v:,}" for k, v in c.outcomes.items())
-        noise = c.noise if c.noise == NO_NOISE else f"{c.noise} {c.eps:g} {unit}"
-        row = [noise, NAMES[c.controller], c.region]
-        row += [
-            f"{c.episodes:,}",
-            percent(c.reached, surely=False),
-            f"{percent(low)} - {percent(high)}",
-        ]
-        rows.append([*row, outcomes])
-    headings = ("noise", "controller", "starts", "episodes", "reached", "95%", "outcomes")
-    return Table(f"{task.name}: noisy episodes", headings, rows)
+        row = {
+            "noise": c.noise if c.noise == NO_NOISE else f"{c.noise} {c.eps:g} {unit}",
+            "controller": NAMES[c.controller],
+            "starts": c.region,
+            "episodes": f"{c.episodes:,}",
+            "reached": percent(c.reached, surely=False),
+            "95%": f"{percent(low)} - {percent(high)}",
+            "outcomes": outcomes,
+        }
+        rows.append(row)
+    return Table.of(f"{task.name}: noisy episodes", rows)
 
 
 def attack_table(task: Task, counts: Sequence[AttackCount]) -> Table:
@@ -202,24 +214,22 @@ def attack_table(task: Task, counts: Sequence[AttackCount]) -> Table:
     rows = []
     for c in counts:
         low, high = (percent(share) for share in c.interval)
-        row = [NAMES[c.controller], f"{c.starts:,}", f"{c.unaided:,}", f"{c.lost:,}"]
-        row.append(percent(c.lost / max(c.attacked, 1), surely=False))
-        row += [f"{low} - {high}", f"{c.rounds:,}", f"{sum(c.tried.values()):,}", f"{c.samples:,}"]
-        rows.append([*row, f"{c.outcome.replace('_', ' ')} from {_point(np.array(c.start))}"])
-    headings = (
-        "controller",
-        "starts",
-        "lost without noise",
-        "lost",
-        "share of the others",
-        "95%",
-        "rounds",
-        "runs",
-        "samples",
-        "strongest signal",
-    )
+        signal = f"{c.outcome.replace('_', ' ')} from {_point(np.array(c.start))}"
+        row = {
+            "controller": NAMES[c.controller],
+            "starts": f"{c.starts:,}",
+            "lost without noise": f"{c.unaided:,}",
+            "lost": f"{c.lost:,}",
+            "share of the others": percent(c.lost / max(c.attacked, 1), surely=False),
+            "95%": f"{low} - {high}",
+            "rounds": f"{c.rounds:,}",
+            "runs": f"{sum(c.tried.values()):,}",
+            "samples": f"{c.samples:,}",
+            "strongest signal": signal,
+        }
+        rows.append(row)
     title = f"{task.name}: attack, a search for noise on {where} of up to {counts[0].eps:g} {unit}"
-    return Table(title, headings, rows)
+    return Table.of(title, rows)
 
 
 def signals_table(task: Task, counts: Sequence[AttackCount]) -> Table:
@@ -235,34 +245,20 @@ def comparison_table(task: Task, comparisons: Sequence[Comparison]) -> Table:
     rows = []
     for c in comparisons:
         low, high = (f"{100 * end:.1f}" for end in c.interval)
-        rows.append(
-            [
-                c.noise,
-                _both(c.unaided),
-                f"{c.compared:,} of {c.starts:,}",
-                _both(c.lost),
-                f"{100 * c.difference:.1f} ({low} to {high})",
-                _both(c.late),
-                _both(c.time),
-                _both(c.way),
-            ]
-        )
-    headings = (
-        "noise",
-        "lost without noise",
-        "starts compared",
-        "lost under noise",
-        "difference, 95% [points]",
-        "late",
-        "time, median and 99%",
-        "way, median and 99%",
-    )
+        row = {
+            "noise": c.noise,
+            "lost without noise": _both(c.unaided),
+            "starts compared": f"{c.compared:,} of {c.starts:,}",
+            "lost under noise": _both(c.lost),
+            "difference, 95% [points]": f"{100 * c.difference:.1f} ({low} to {high})",
+            "late": _both(c.late),
+            "time, median and 99%": _both(c.time),
+            "way, median and 99%": _both(c.way),
+        }
+        rows.append(row)
     names = " and ".join(NAMES[name] for name in comparisons[0].lost)
-    return Table(
-        f"{task.name}: {names} from the same starts; time and way are relative to those without noise",
-        headings,
-        rows,
-    )
+    title = f"{names} from the same starts; time and way are relative to those without noise"
+    return Table.of(f"{task.name}: {title}", rows)
 
 
 def _both(values: Mapping[str, int | tuple[float, float]]) -> str:
@@ -313,20 +309,24 @@ def robustness_sentence(robustness: Robustness) -> str:
 def noise_table(noise: LogNoise) -> Table:
     """Returns the noise of a log: a row for each column; "-" is what the log does not tell."""
 
-    def told(value: float, unit: str = "") -> str:
-        return "-" if np.isnan(value) else f"{value:.2g}{unit}"
+    def told(value: float) -> str:
+        return "-" if np.isnan(value) else f"{value:.2g}"
 
     rows = []
     for c in noise.columns:
-        if not len(c.errors):
-            rows.append([c.name, *["-"] * 8])
-            continue
-        held = f"{c.held}, {100 * c.held_rate:.0f}%" if c.held else "0"
-        drift = f"{c.drift:.2g}, {c.drift_rate:.2g}/s" if c.drift else "0"
-        row = [c.name, told(c.delay), held, told(c.quantum), told(c.bias), drift]
-        rows.append([*row, told(c.bound), told(c.sigma), f"{c.correlation:.2f}"])
-    headings = ("", "delay", "held", "quantum", "bias", "drift", "bound", "sigma", "lag 1")
-    return Table("noise, in the units of the log; delay and held in samples", headings, rows)
+        row = {
+            "": c.name,
+            "delay": told(c.delay),
+            "held": f"{c.held}, {100 * c.held_rate:.0f}%" if c.held else "0",
+            "quantum": told(c.quantum),
+            "bias": told(c.bias),
+            "drift": f"{c.drift:.2g}, {c.drift_rate:.2g}/s" if c.drift else "0",
+            "bound": told(c.bound),
+            "sigma": told(c.sigma),
+            "lag 1": f"{c.correlation:.2f}",
+        }
+        rows.append(row if len(c.errors) else dict.fromkeys(row, "-") | {"": c.name})
+    return Table.of("noise, in the units of the log; delay and held in samples", rows)
 
 
 # ---- sets
@@ -348,8 +348,3 @@ def extent(run: Run, mode: int) -> str:
 def _point(z: np.ndarray) -> str:
     """Returns a chart point (d,), to a thousandth."""
     return f"({', '.join(f'{v + 0.0:.3f}' for v in np.round(z, 3))})"
-
-
-def _seconds(time: float, won: float) -> str:
-    """Returns a worst time to arrival; "-" where nothing is won."""
-    return f"{time:.2f} s" if won else "-"

@@ -3,30 +3,9 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-
-
-@dataclass(frozen=True)
-class Measured:
-    """One figure: units of work a second of ours and of the other way, and their ratio in each pair.
-
-    Attributes:
-        name, against, target: as in `Figure`.
-        ours, other: medians, in `unit`; `other` is None where nothing is compared.
-        unit: of both.
-        ratios: how many times faster ours is, of each pair.
-        memory: the most that ours took [MB], where that is asked for.
-    """
-
-    name: str
-    against: str
-    target: str
-    unit: str
-    ours: float
-    other: float | None
-    ratios: list[float]
-    memory: float | None
 
 
 @dataclass(frozen=True)
@@ -54,16 +33,24 @@ class Figure:
     least: float = 0.5
     slow: bool = False
 
-    def measure(self, pairs: int) -> Measured:
-        """Time both, alternately."""
+    def measure(self, pairs: int) -> dict[str, Any]:
+        """Time both, alternately.
+
+        Returns name, against, target and unit, with `ours` and `other`: medians in this unit, of which
+        `other` is None where nothing is compared; `ratios`: how many times faster ours is, of each pair; and
+        `memory`: the most that ours took [MB], where that is asked for.
+        """
         both = [work for work in (self.ours, self.other) if work]
         rates = np.array([[_rate(work, self.least) for work in both] for _ in range(pairs)])
-        ratios = (rates[:, 0] / rates[:, 1]).tolist() if self.other else []
-        found = [self._shown(float(rate)) for rate in np.median(rates, axis=0)]
-        other = found[1] if self.other else None
-        memory = self.memory() if self.memory else None
-        texts = (self.name, self.against, self.target, self.unit)
-        return Measured(*texts, found[0], other, ratios, memory)
+        ours, *other = [self._shown(float(rate)) for rate in np.median(rates, axis=0)]
+        texts = {"name": self.name, "against": self.against, "target": self.target}
+        return texts | {
+            "unit": self.unit,
+            "ours": ours,
+            "other": other[0] if other else None,
+            "ratios": (rates[:, 0] / rates[:, 1]).tolist() if other else [],
+            "memory": self.memory() if self.memory else None,
+        }
 
     def _shown(self, rate: float) -> float:
         times = {"s": 1.0, "ms": 1e3, "us": 1e6}

@@ -2,17 +2,15 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cached_property
 
 import gymnasium
-import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
 import hyrl_mj
 from benchmarks import Figure
 from benchmarks.runs import Runs
-from hyrl_mj import Chart, Outcome, Task
+from hyrl_mj import Task
 from hyrl_mj.gym_export import BatchedEnv
 from hyrl_mj.simulation import LoopSettings, Noise, closed_loop
 
@@ -26,15 +24,13 @@ def figures(runs: Runs) -> Iterator[Figure]:
     for task, n, target in (
         (vehicle, 4096, ">= 0.5"),
         (vehicle, 64, ">= 0.25"),
-        (CartPole(), 1024, ">= 0.9"),
+        (hyrl_mj.get_task("quadrotor"), 1024, ">= 0.9"),
     ):
         name = f"{task.name}, n = {n}, with observation, reward, ends, resets"
-        yield Figure(name, "samples/s", raw, target, _episodes(task, n), _physics(task, n))
-    single = _one_environment(vehicle)
-    name = "vehicle, n = 4096, in batches"
-    yield Figure(
-        name, "samples/s", "the Gymnasium environment", ">= 20", _episodes(vehicle, 4096), single
-    )
+        yield Figure(name, "samples/s", raw, target, episodes(task, n), _physics(task, n))
+    name, single = "vehicle, n = 4096, in batches", "the Gymnasium environment"
+    ours, theirs = episodes(vehicle, 4096), _one_environment(vehicle)
+    yield Figure(name, "samples/s", single, ">= 20", ours, theirs)
     name = "PointMaze_Medium-v3, n = 256, through from_gymnasium"
     for mode, against in (("sync", "SyncVectorEnv"), ("async", "AsyncVectorEnv")):
         with _outside("PointMaze_Medium-v3", 256, mode) as (ours, theirs):
@@ -43,7 +39,8 @@ def figures(runs: Runs) -> Iterator[Figure]:
     yield Figure(name, "samples/s", raw, ">= 0.3", _closed_loop(runs), _physics(vehicle, 4096))
 
 
-def _episodes(task: Task, n: int) -> Callable[[], int]:
+def episodes(task: Task, n: int) -> Callable[[], int]:
+    """Returns samples of so many episodes under random inputs, which are reset where they end."""
     env = BatchedEnv(task, n)
     env.seed(0)
     env.reset()
@@ -125,67 +122,3 @@ def _closed_loop(runs: Runs) -> Callable[[], int]:
         return int(rollout.length.sum())
 
     return work
-
-
-class CartPole(Task):
-    """A pole to balance on a cart, at two substeps a sample: more physics than a point that moves."""
-
-    name = "cart-pole"
-    chart = Chart(("cart", "pole"), ("m", "rad"), (-2.4, -0.3), (2.4, 0.3), (False, False))
-    inputs = ("push",)
-    noisy = (True, True, True, True)
-    max_steps, worst_reward = 200, 0.0
-    start_low, start_high = (-0.05, -0.05), (0.05, 0.05)
-    observation_low, observation_high = (-10.0,) * 4, (10.0,) * 4
-
-    @cached_property
-    def model(self) -> mujoco.MjModel:
-        return mujoco.MjModel.from_xml_string(
-            """
-            <mujoco model="cart-pole">
-              <option timestep="0.01" integrator="RK4"/>
-              <custom><numeric name="sample_time" data="0.02"/></custom>
-              <worldbody>
-                <geom type="plane" size="5 5 0.1" pos="0 0 -1"/>
-                <body>
-                  <joint name="cart" type="slide" axis="1 0 0" limited="true" range="-3 3" damping="0.1"/>
-                  <geom type="box" size="0.1 0.1 0.05" mass="1"/>
-                  <body pos="0 0 0.05">
-                    <joint name="pole" axis="0 1 0" damping="0.01"/>
-                    <geom type="capsule" fromto="0 0 0 0 0 0.6" size="0.045" mass="0.1"/>
-                  </body>
-                </body>
-              </worldbody>
-              <actuator><motor name="push" joint="cart" gear="10" ctrlrange="-1 1"/></actuator>
-              <sensor>
-                <jointpos joint="cart"/><jointpos joint="pole"/>
-                <jointvel joint="cart"/><jointvel joint="pole"/>
-              </sensor>
-            </mujoco>
-            """
-        )
-
-    def z(self, measured: np.ndarray) -> np.ndarray:
-        return measured[:, :2]
-
-    def observation(self, measured: np.ndarray) -> np.ndarray:
-        return measured
-
-    def reward(self, measurement: np.ndarray, u: np.ndarray) -> np.ndarray:
-        return np.cos(measurement[:, 1])
-
-    def ending(self, measurement: np.ndarray) -> np.ndarray:
-        fallen = (np.abs(measurement[:, 1]) > 0.2) | (np.abs(measurement[:, 0]) > 2.4)
-        return np.where(fallen, Outcome.CRASHED, Outcome.RUNNING)
-
-    def verdict(self, measurement: np.ndarray) -> np.ndarray:
-        return np.full(len(measurement), Outcome.REACHED)
-
-    def arrived(self, z: np.ndarray) -> np.ndarray:
-        return self.miss(z) < 0.2
-
-    def miss(self, z: np.ndarray) -> np.ndarray:
-        return np.abs(z[:, 1])
-
-    def direction(self, path: np.ndarray) -> np.ndarray:
-        return np.where(path[-1, :, 1] > 0, 0, 1)

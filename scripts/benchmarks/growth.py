@@ -8,13 +8,18 @@ Each size runs in a process of its own, so that its peak memory is its own:
 import subprocess
 import sys
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+import hyrl_mj
+from benchmarks.engine import SAMPLES, episodes
 from benchmarks.runs import peak_memory
+from hyrl_mj.judging import Regions, noisy_episodes
 
 SIZES = {
     "simulations": (1, 16, 256, 4_096, 65_536),
@@ -22,44 +27,22 @@ SIZES = {
     "episodes": (1_000, 10_000, 100_000, 1_000_000),
 }
 LABELS = {
-    "simulations": "simulations side by side, 100 samples",
+    "simulations": f"simulations side by side, {SAMPLES} samples",
     "rods": "rods of the first level",
     "episodes": "robustness episodes",
 }
 
 
-def measure(kind: str, size: int, run: Path) -> tuple[float, float]:
-    """Seconds and peak memory [MB] of one size, in this process."""
-    import hyrl_mj
-
-    task = hyrl_mj.get_task("vehicle")
+def work_of(kind: str, size: int, path: Path) -> Callable[[], object]:
+    """Returns the work of one size, on a run of the vehicle."""
+    run = hyrl_mj.load_run(path)
     if kind == "simulations":
-        from hyrl_mj.gym_export import BatchedEnv
-
-        env = BatchedEnv(task, size)
-        env.seed(0)
-        env.reset()
-        u = np.zeros((size, 1))
-        began = time.perf_counter()
-        for _ in range(100):
-            done = np.flatnonzero(env.step(u).done)
-            if len(done):
-                env.reset(done)
-    elif kind == "rods":
-        policy = hyrl_mj.load_run(run).policy
-        began = time.perf_counter()
-        hyrl_mj.find_critical_set(task, policy, size, 1 / 32)
-    else:
-        from hyrl_mj.judging import Regions, noisy_episodes
-        from hyrl_mj.simulation import Noise
-
-        finished = hyrl_mj.load_run(run)
-        began = time.perf_counter()
-        loops = {"HyRL": finished.controller}
-        regions = Regions(finished.critical_set.points)
-        noisy_episodes(task, regions, loops, (Noise("uniform", 0.1),), size)
-    took = time.perf_counter() - began
-    return took, peak_memory()
+        return episodes(run.task, size)
+    if kind == "rods":
+        return partial(hyrl_mj.find_critical_set, run.task, run.policy, size, 1 / 32)
+    loops, regions = {"HyRL": run.controller}, Regions(run.critical_set.points)
+    noise = hyrl_mj.Noise("uniform", 0.1)
+    return partial(noisy_episodes, run.task, regions, loops, (noise,), size)
 
 
 def plot(run: Path, path: Path) -> None:
@@ -93,4 +76,7 @@ def _child(kind: str, size: int, run: Path) -> tuple[float, ...]:
 
 
 if __name__ == "__main__":
-    print(*measure(sys.argv[1], int(sys.argv[2]), Path(sys.argv[3])))
+    work = work_of(sys.argv[1], int(sys.argv[2]), Path(sys.argv[3]))
+    began = time.perf_counter()
+    work()
+    print(time.perf_counter() - began, peak_memory())

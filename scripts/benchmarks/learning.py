@@ -3,25 +3,51 @@
 import sys
 import time
 from collections.abc import Callable, Iterator
-from functools import partial
 from itertools import count
+from types import SimpleNamespace
 
 import gymnasium
-from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
+import numpy as np
 
 import hyrl_mj
 from benchmarks import Figure
-from benchmarks.quality import circle_return, vehicle_share
 from benchmarks.runs import Runs
+from hyrl_mj.gym_export import BatchedEnv
 from hyrl_mj.learning import preset
 from hyrl_mj.learning.training import Score, TaskGround, export, threads, train
-from hyrl_mj.policies import MlpPolicy, algorithms
-from hyrl_mj.tasks import Task
+from hyrl_mj.policies import MlpPolicy, PolicyController, algorithms
+from hyrl_mj.simulation import closed_loop
+from hyrl_mj.tasks import Outcome, Task
+
+
+def circle_return(task: Task, policy: MlpPolicy) -> float:
+    """Returns the mean return over 150 samples from 500 starts drawn evenly from pi +- 0.2 rad."""
+    env = BatchedEnv(task, 500)
+    env.reset(z=np.pi + np.random.default_rng(0).uniform(-0.2, 0.2, (500, 1)))
+    rewards = [env.step(policy.act(env.plant.measurement)).reward for _ in range(task.max_steps)]
+    return float(np.sum(rewards) / 500)
+
+
+def vehicle_share(task: Task, policy: MlpPolicy) -> float:
+    """Returns the share of the winnable starts in [0, 0.5] x [-1, 1] m that the policy passes from."""
+    x, y = np.meshgrid(np.linspace(0, 0.5, 50), np.linspace(-1, 1, 50), indexing="ij")
+    z0 = np.stack([x.ravel(), y.ravel()], axis=1)
+
+    def outcome(act: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        return closed_loop(task, PolicyController(SimpleNamespace(act=act)), z0).outcome
+
+    # Steering hard drives into the wall in the end; it has passed if that comes before a crash.
+    winnable = np.any(
+        [outcome(lambda z, u=u: np.full((len(z), 1), u)) != Outcome.CRASHED for u in (-1.0, 1.0)],
+        axis=0,
+    )
+    won = outcome(policy.act) == Outcome.REACHED
+    return float((won & winnable).sum() / winnable.sum())
+
 
 # How good a policy has to be: the mean return from pi +- 0.2 rad; the share of winnable starts passed.
 GOOD: dict[str, tuple[Callable[[Task, MlpPolicy], float], float, str]] = {
-    "unit_circle": (partial(circle_return, starts=500), -30.5, ">= 15x"),
+    "unit_circle": (circle_return, -30.5, ">= 15x"),
     "vehicle": (vehicle_share, 0.995, ">= 3x"),
 }
 # Samples of the single environment between two looks at its policy, and the time after which it is given
@@ -86,29 +112,18 @@ def _paper(task: Task, quality: Callable[[Task, MlpPolicy], float], enough: floa
             policy_kwargs={"net_arch": list(settings.hidden)},
             **settings.options,
         )
-        judge = _Quality(task, quality, enough)
+        judge, end = _Quality(task, quality, enough), time.perf_counter() + PATIENCE
+
+        def goes_on(*_: object) -> bool:
+            if model.num_timesteps % INTERVAL:
+                return True
+            return time.perf_counter() < end and judge(export(model, task)) < judge.enough
+
         with threads(1):
-            model.learn(settings.samples, callback=_Until(task, judge))
+            model.learn(settings.samples, callback=goes_on)
         if judge(export(model, task)) < judge.enough:
             late = f"{task.name}: SB3 did not reach {enough} in {PATIENCE:.0f} s"
             print(f"{late}: the ratio is greater than this", file=sys.stderr)
         return 1
 
     return work
-
-
-class _Until(BaseCallback):
-    """Ends a training once the policy is good enough, or patience is at its end."""
-
-    def __init__(self, task: Task, judge: _Quality):
-        super().__init__()
-        self._task, self._judge = task, judge
-        self._end = time.perf_counter() + PATIENCE
-
-    def _on_step(self) -> bool:
-        if self.num_timesteps % INTERVAL:
-            return True
-        if time.perf_counter() > self._end:
-            return False
-        model: BaseAlgorithm = self.model
-        return self._judge(export(model, self._task)) < self._judge.enough

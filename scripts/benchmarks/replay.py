@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from contextlib import closing
 from copy import copy
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -14,18 +15,12 @@ from hyrl_mj.viz import ReplayOptions
 from hyrl_mj.viz.replay import Show, render_replay
 
 
-class _GoStraight:
-    """Past the pillar on the left."""
-
-    def act(self, measured: np.ndarray) -> np.ndarray:
-        return np.where(measured[:, :1] < 1.0, 1.0, 0.0)
-
-
 def figures(runs: Runs) -> Iterator[Figure]:
     """At two sizes, and with a camera that moves."""
     task = hyrl_mj.get_task("vehicle")
     noise = hyrl_mj.Noise("alternating", 0.1)
-    arc = hyrl_mj.simulate(task, _GoStraight(), [0.0, 0.0], noise=noise)
+    left = SimpleNamespace(act=lambda measured: np.where(measured[:, :1] < 1.0, 1.0, 0.0))
+    arc = hyrl_mj.simulate(task, left, [0.0, 0.0], noise=noise)
     seconds = 4  # three of driving and one of the last frame
 
     for size, fps, camera, target in (

@@ -1,12 +1,16 @@
-"""The finished runs that the figures are about, made when they are first asked for."""
+"""The finished runs that the figures are about, made when they are first asked for, and what that takes."""
 
+import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 
 import hyrl_mj
+from benchmarks import Figure
 from hyrl_mj import Run
 
 
@@ -58,3 +62,23 @@ def peak_memory(pid: int | str = "self") -> float:
         return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM"))
     except (OSError, StopIteration):  # it has just ended, or there is no such file here
         return 0.0
+
+
+def figures(runs: Runs) -> Iterator[Figure]:
+    """The command `hyrl-mj run` with all its stages, video included, each time with a seed of its own."""
+    for task in ("vehicle", "unit_circle"):
+        seeds, peaks = count(), []
+
+        def work(task=task, seeds=seeds, peaks=peaks) -> int:
+            path = runs.folder / f"{task}_whole"
+            peaks.append(runs.make(task, next(seeds), path))
+            shutil.rmtree(path)
+            return 1
+
+        def memory(peaks=peaks) -> float:
+            return max(peaks)
+
+        target = "<= 60 s, <= 1500 MB"
+        yield Figure(
+            f"hyrl-mj run {task}", "s", "", target, work, memory=memory, least=0.0, slow=True
+        )

@@ -1,9 +1,10 @@
 """Critical set and extended sets, against the same starts one at a time."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from importlib import import_module
 from itertools import product
+from types import SimpleNamespace
 from typing import Any
 from unittest import mock
 
@@ -28,14 +29,13 @@ SHARE = 25
 def figures(runs: Runs) -> Iterator[Figure]:
     """The search for M*, and the extended sets of both problems."""
     run = runs.load("vehicle")
-    search = _OneRod(run)
     yield Figure(
         f"critical set, vehicle, {RODS} x {RODS} rods, all levels",
         "ms",
         "rod by rod, SB3's predict",
         ">= 50x",
         lambda: len([find_critical_set(run.task, run.policy, RODS, RESOLUTION)]),
-        search.all,
+        _rod_by_rod(run),
     )
     for name in ("vehicle", "unit_circle"):
         yield _extension(runs.load(name))
@@ -45,9 +45,8 @@ def _extension(run: Run) -> Figure:
     task, settings = run.task, run.settings
     args = (task, run.policy, run.critical_set.points, run.partition, settings.eps)
     calls: list[tuple[Any, np.ndarray, LoopSettings]] = []
-    runs_of_ways = import_module(
-        "hyrl_mj.simulation.way_runs"
-    )  # the package has a function of that name
+    # The package has a function of that name.
+    runs_of_ways = import_module("hyrl_mj.simulation.way_runs")
     batched = runs_of_ways.closed_loop
 
     def noted(task: Task, controller: Any, z0: np.ndarray, *, settings: LoopSettings) -> Any:
@@ -57,7 +56,7 @@ def _extension(run: Run) -> Figure:
     with mock.patch.object(runs_of_ways, "closed_loop", noted):
         extend(*args)
     starts = sum(len(z0) for _, z0, _ in calls)
-    predict = _Predict(run)
+    predict = _predict(run)
 
     def ours() -> int:
         extend(*args)
@@ -102,54 +101,41 @@ def _one_start(task: Task, policy: Any, z: np.ndarray, steps: int, backward: boo
     return np.array(path)
 
 
-class _Predict:
-    """The stage-1 policy by SB3's predict."""
+def _predict(run: Run) -> Any:
+    """The stage-1 policy by SB3's predict, of one measurement (1, p)."""
+    task = run.task
+    model: BaseAlgorithm = build(task, run.settings.stage1, 0, start_from=run.policy)
 
-    def __init__(self, run: Run):
-        self._task = run.task
-        self._model: BaseAlgorithm = build(run.task, run.settings.stage1, 0, start_from=run.policy)
+    def act(measured: np.ndarray) -> np.ndarray:
+        observation = task.observation(measured)[0].astype(np.float32)
+        action, _ = model.predict(observation, deterministic=True)
+        return (action if task.input_levels is None else task.input_levels[action])[None]
 
-    def act(self, measured: np.ndarray) -> np.ndarray:
-        """Of one measurement (1, p)."""
-        observation = self._task.observation(measured)[0].astype(np.float32)
-        action, _ = self._model.predict(observation, deterministic=True)
-        levels = self._task.input_levels
-        return (action if levels is None else levels[action])[None]
+    return SimpleNamespace(act=act)
 
 
-class _OneRod:
-    """The paper's search (Algorithm 1): rod by rod, its ends one after the other."""
+def _rod_by_rod(run: Run) -> Callable[[], int]:
+    """The paper's search of the whole chart (Algorithm 1): rod by rod, its ends one after the other."""
+    task, policy, chart = run.task, _predict(run), run.task.chart
+    cell = chart.sides.max() / RODS
 
-    def __init__(self, run: Run):
-        self._task, self._predict = run.task, _Predict(run)
-
-    def all(self) -> int:
-        """Search the whole chart."""
-        chart = self._task.chart
-        sides = np.subtract(chart.high, chart.low)
-        cell = sides.max() / RODS
-        axes = [
-            np.arange(low + cell / 2, high, cell)
-            for low, high in zip(chart.low, chart.high, strict=True)
-        ]
-        found = []
-        for point in product(*axes):
-            for axis in np.eye(len(sides)):
-                self._search(np.array(point), axis, cell, RESOLUTION * cell, found)
-        return 1
-
-    def _search(self, centre, axis, length, least, found) -> None:
-        ends = [centre - axis * length / 2, centre + axis * length / 2]
-        paths = [
-            _one_start(self._task, self._predict, end, WaySettings.samples, backward=False)
-            for end in ends
-        ]
-        moves = [path[-1] - path[0] for path in paths]
+    def search(centre: np.ndarray, axis: np.ndarray, length: float) -> None:
+        moves = []
+        for end in (centre - axis * length / 2, centre + axis * length / 2):
+            path = _one_start(task, policy, end, WaySettings.samples, backward=False)
+            moves.append(path[-1] - path[0])
         apart = np.linalg.norm(moves[1] - moves[0])
         if apart <= WaySettings.parting * sum(np.linalg.norm(move) for move in moves):
             return
-        if length <= least:
-            found.append(centre)
-            return
-        for half in (-0.25, 0.25):
-            self._search(centre + half * length * axis, axis, length / 2, least, found)
+        if length > RESOLUTION * cell:
+            for half in (-0.25, 0.25):
+                search(centre + half * length * axis, axis, length / 2)
+
+    def work() -> int:
+        sides = zip(chart.low, chart.high, strict=True)
+        for point in product(*(np.arange(low + cell / 2, high, cell) for low, high in sides)):
+            for axis in np.eye(chart.dimension):
+                search(np.array(point), axis, cell)
+        return 1
+
+    return work

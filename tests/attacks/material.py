@@ -56,10 +56,10 @@ class Material:
         ahead = MlpPolicy(task, "ppo", "tanh", weights)
         run = Run(path, preset(task, "smoke"))
         write_config(run)
-        with run.stage("train"):
+        with run.manifest.stage("train"):
             ahead.save(path / "policy.safetensors")
             Arrivals(990, 0, 1_000).save(path / "arrivals.json")
-        with run.stage("extended-sets"):
+        with run.manifest.stage("extended-sets"):
             grid = Grid.with_cells(task.chart, 4)
             inside = np.ones(len(grid.nodes), dtype=bool)
             sets = (GridSet(grid, -np.ones(len(grid.nodes))),) * 2
@@ -67,7 +67,7 @@ class Material:
             ExtendedSets((0, 1), sets, (inside, inside), 0.3, 0.1, *ends).save(
                 path / "extended_sets.npz"
             )
-        with run.stage("retrain"):
+        with run.manifest.stage("retrain"):
             for mode in (0, 1):
                 ahead.save(path / f"mode_{mode}.safetensors")
             Retraining((ModeResult(0, 1.0, 1), ModeResult(1, 1.0, 1))).save(
