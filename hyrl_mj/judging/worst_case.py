@@ -2,8 +2,6 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
-from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -33,7 +31,7 @@ from hyrl_mj.judging.game import (
 from hyrl_mj.judging.proof.cells import decides
 from hyrl_mj.judging.proof.certificate import Certificate, Proved
 from hyrl_mj.judging.proof.counterexamples import Broken, find_counterexamples
-from hyrl_mj.judging.proof.replays import Replays, play
+from hyrl_mj.judging.proof.replays import replay
 from hyrl_mj.policies import BLAS, Controller
 from hyrl_mj.sets import GridSet
 from hyrl_mj.simulation import LoopSettings, closed_loop
@@ -132,15 +130,11 @@ def _replays(
     scores: Mapping[str, tuple[Score, ...]],
 ) -> tuple[ReplayCount, ...]:
     """Plays in MuJoCo what the scores at the largest bound say, and returns what was lost."""
-    plans = [
-        plan
+    counts = (
+        replay(certificate, name, controller, scores[name][-1])
         for name, controller in controllers.items()
-        if (plan := Replays.of_score(certificate, name, controller, scores[name][-1]))
-    ]
-    task, batches = certificate.game.task, [batch for plan in plans for batch in plan.batches]
-    # One after the other: the physics takes all cores, and the rest holds the interpreter's lock.
-    played = map(partial(play, task), progress_bar(batches, "replays", "games", len(batches)))
-    return tuple(plan.count(list(islice(played, len(plan.batches)))) for plan in plans)
+    )
+    return tuple(count for count in counts if count)
 
 
 def _score(certificate: Certificate, name: str, nodes: NodeScore, broken: Broken | None) -> Score:

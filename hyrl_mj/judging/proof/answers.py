@@ -158,9 +158,7 @@ def _check_task(cells: Cells, task: Task) -> None:
 
 def _all(counts: np.ndarray) -> np.ndarray:
     """Returns all indices (n, d) of an array with `counts` (d,) entries along each axis."""
-    return np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), -1).reshape(
-        -1, len(counts)
-    )
+    return np.indices(tuple(counts)).reshape(len(counts), -1).T
 
 
 def _is_sharp(found: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ import numpy as np
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.judging.proof.affine import Affine, Unbounded
-from hyrl_mj.judging.proof.networks import bounds_of, program_of
+from hyrl_mj.judging.proof.networks import bounds_of, method_of, program_of
 from hyrl_mj.judging.proof.rules import Truth
 from hyrl_mj.judging.proof.turns import tells_turns
 from hyrl_mj.physics import memory, mjcf
@@ -53,7 +53,7 @@ def check_assumptions(task: Task) -> None:
     if why := memory.remembers(model) or memory.why_not_direct(model):
         raise Unbounded(f"the plant of {task.name} may not follow its inputs at once: {why}")
     for name in ("observation", "ending", "verdict"):
-        program = program_of(task, getattr(task, name), _method(task, name))
+        program = program_of(task, name)
         _check_turns(task, name, program)
         _check_program(task, name, program)
 
@@ -63,10 +63,6 @@ def _is_own(task: Task, name: str) -> bool:
     return method is not getattr(Task, name)
 
 
-def _method(task: Task, name: str) -> str:
-    return f"the method {name} of {task.name}"
-
-
 def _check_turns(task: Task, name: str, program: Program) -> None:
     """Raises `Unbounded` if a method may tell whole turns of a periodic coordinate apart."""
     chart = task.chart
@@ -74,8 +70,8 @@ def _check_turns(task: Task, name: str, program: Program) -> None:
         turn = chart.sides * (np.arange(chart.dimension) == axis)
         if tells_turns(program, turn):
             raise Unbounded(
-                f"{_method(task, name)} tells whole turns of {chart.names[axis]} apart, or may do so: let it "
-                "use the sine and the cosine, or self.chart.wrap(measured)"
+                f"{method_of(task, name)} tells whole turns of {chart.names[axis]} apart, or may do so: "
+                "let it use the sine and the cosine, or self.chart.wrap(measured)"
             )
 
 
@@ -88,12 +84,12 @@ def _check_program(task: Task, name: str, program: Program) -> None:
     chart, rng = task.chart, np.random.default_rng(1)
     beyond = chart.sides * (0.1 + np.array(chart.periodic))
     z = rng.uniform(chart.low - beyond, chart.high + beyond, (COMPARED, chart.dimension))
-    found = bounds_of(program, _method(task, name), Affine.box(z, np.zeros(chart.dimension)))
+    found = bounds_of(program, method_of(task, name), Affine.box(z, np.zeros(chart.dimension)))
     order, fewer = rng.permutation(COMPARED), (1, 2, 7, 33, 150, 600)
     try:
         parts = [method(z), method(z[order])[np.argsort(order)], *(method(z[:k]) for k in fewer)]
     except BadInput as error:
-        raise Unbounded(f"{_method(task, name)} cannot be followed: {error}") from error
+        raise Unbounded(f"{method_of(task, name)} cannot be followed: {error}") from error
     for given in parts:
         k = len(given)
         if isinstance(found, Truth):
@@ -105,6 +101,6 @@ def _check_program(task: Task, name: str, program: Program) -> None:
         if not same.all():
             row = int(np.argwhere(~same)[0][0])
             raise Unbounded(
-                f"{_method(task, name)} gives another result at {chart.format(z[row])} than the operations "
+                f"{method_of(task, name)} gives another result at {chart.format(z[row])} than the operations "
                 "that it does with the measurement: it may depend on other rows, or on what was before"
             )

@@ -11,7 +11,7 @@ from hyrl_mj.errors import BadInput
 from hyrl_mj.judging.game import Lattice
 from hyrl_mj.judging.proof.affine import Affine, Unbounded
 from hyrl_mj.judging.proof.assumptions import check_assumptions
-from hyrl_mj.judging.proof.networks import bounds_of, program_of
+from hyrl_mj.judging.proof.networks import bounds_of, method_of, program_of
 from hyrl_mj.judging.proof.rules import as_form
 from hyrl_mj.sets import Grid, Nodes
 from hyrl_mj.tasks import Outcome, Task
@@ -225,8 +225,7 @@ def _ends(task: Task, boxes: Affine) -> tuple[np.ndarray, np.ndarray, np.ndarray
     """Returns where an episode may fail, surely ends as a success, or is one if cut off: (n,) bool each."""
     found = []
     for name in ("ending", "verdict"):
-        what = f"the method {name} of {task.name}"
-        outcome = bounds_of(program_of(task, getattr(task, name), what), what, boxes)
+        outcome = bounds_of(program_of(task, name), method_of(task, name), boxes)
         found.append(as_form(outcome, len(boxes.generators)))
     ending, verdict = found
     # The outcomes RUNNING, REACHED, and the failures are numbered in this order.

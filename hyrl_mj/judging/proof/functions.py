@@ -23,10 +23,6 @@ from hyrl_mj.judging.proof.affine import (
 # ---- functions of one quantity
 
 
-def never(a: Affine) -> np.ndarray:
-    return np.zeros(np.shape(a.centre), dtype=bool)
-
-
 def may_be_infinite(a: Affine) -> np.ndarray:
     return a.wild
 
@@ -40,7 +36,7 @@ def smooth(
     slope: Callable[[np.ndarray], np.ndarray],
     curvature: Callable[[np.ndarray, np.ndarray], np.ndarray],
     extremes: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]],
-    nowhere: Callable[[Affine], np.ndarray] = never,
+    nowhere: Callable[[Affine], Any] = lambda a: False,
     nonnegative: bool = False,
 ) -> Callable[[Affine], Affine]:
     """Returns the rule of a smooth function: its tangent in the centre, or its extremes if that tells less.
@@ -130,7 +126,6 @@ def stepwise(value: Callable[[np.ndarray], np.ndarray]) -> Callable[[Affine], Af
 
 
 def maximum(a: Affine, b: Affine) -> Affine:
-    a, b = pair(a, b)
     low, high = np.maximum(a.low, b.low), np.maximum(a.high, b.high)
     either = choose(a.low >= b.high, a, b)
     clear = (a.low >= b.high) | (b.low >= a.high)
@@ -139,7 +134,6 @@ def maximum(a: Affine, b: Affine) -> Affine:
 
 
 def minimum(a: Affine, b: Affine) -> Affine:
-    a, b = pair(a, b)
     found = negative(maximum(negative(a), negative(b)))
     return replace(found, nonnegative=a.positive & b.positive)
 
