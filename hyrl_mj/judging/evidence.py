@@ -27,8 +27,7 @@ class VerdictSettings:
     episodes: Annotated[int, Integer(1_000, 10**9)] = 1_000
     attacked: Annotated[int, Integer(300, 10**9)] = 300
 
-    def __post_init__(self) -> None:
-        check_fields(self)
+    __post_init__ = check_fields
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from hyrl_mj.judging.game import (
     lattice_grid,
     share,
 )
-from hyrl_mj.judging.proof.cells import decides
+from hyrl_mj.judging.proof.cells import why_no_cells
 from hyrl_mj.judging.proof.certificate import Certificate, Proved
 from hyrl_mj.judging.proof.counterexamples import Broken, find_counterexamples
 from hyrl_mj.judging.proof.replays import replay
@@ -70,7 +70,7 @@ def worst_case(
     Lattice.check(task)
     parts, grid = tuple(parts), lattice_grid(task, cells)
     Lattice.check(task, grid)
-    exact = decides(task, grid)
+    exact = Lattice.decides(task, grid) and not why_no_cells(task, grid.counts)
     largest = max(*bounds, LARGEST) if exact else max(bounds)
     fine = Game(task, parts, controllers, largest, everywhere, grid)
     names = [*controllers, LIMIT]

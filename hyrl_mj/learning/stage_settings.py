@@ -35,8 +35,7 @@ class WaySettings:
     least_share: Annotated[float, _SHARE] = 0.01
     near_share: Annotated[float, _SHARE] = 0.5
 
-    def __post_init__(self) -> None:
-        check_fields(self)
+    __post_init__ = check_fields
 
 
 @dataclass(frozen=True)
@@ -57,8 +56,7 @@ class OverlapSettings:
     longest: Annotated[float, Number(0, 3_600, above=True)] = 2.0
     patience: Annotated[float, Number(0, 3_600)] = 0.5
 
-    def __post_init__(self) -> None:
-        check_fields(self)
+    __post_init__ = check_fields
 
 
 @dataclass(frozen=True)
@@ -106,8 +104,7 @@ class ModeSettings:
     worth_attacking: Annotated[float, _SHARE] = 0.9
     may_break: Annotated[float, _SHARE] = 0.05
 
-    def __post_init__(self) -> None:
-        check_fields(self)
+    __post_init__ = check_fields
 
 
 @dataclass(frozen=True)
@@ -130,5 +127,4 @@ class TableSettings:
     tables: Annotated[int, Integer(1, 100)] = 6
     worst: Annotated[float, _SHARE] = 0.8
 
-    def __post_init__(self) -> None:
-        check_fields(self)
+    __post_init__ = check_fields

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache, partial
 from typing import ClassVar
 
 import numpy as np
 
-from hyrl_mj.errors import BadInput
+from hyrl_mj.errors import BadInput, counted
 from hyrl_mj.files.artifacts import Saved
 from hyrl_mj.judging.game import Limit, nearest_of
 from hyrl_mj.learning import OverlapSettings
 from hyrl_mj.policies import Policy
 from hyrl_mj.sets import Grid, GridSet, check_points, distance_to
-from hyrl_mj.stages.meeting import least_room, narrow_sentence
+from hyrl_mj.stages.meeting import least_room, where
 from hyrl_mj.stages.partition import (
     Partition,
     check_sets,
@@ -76,13 +76,29 @@ class ExtendedSets(Saved):
             return "one mode, whose set is the whole chart"
         reach = f"T = {self.horizon:.2g} s" if self.horizon else "as far as the ways are open"
         text = f"{len(self.sets)} extended sets, {reach}{self._shared()}"
-        narrow = narrow_sentence(task, self.points, self.between, self.room, self.narrow, self.eps)
-        return f"{text}; {narrow}" if narrow else text
+        return "; ".join([text, *self._narrow_places(task)])
 
     @property
     def narrow(self) -> np.ndarray:
         """Whether the noise needs more room than two modes have at each of the points: (K,) bool."""
         return np.asarray(self.room < 2 * self.eps - self.sets[0].grid.cell)
+
+    def _narrow_places(self, task: Task) -> Iterator[str]:
+        """Yields between which modes nobody can change over in time, and where."""
+        unit, narrow = task.noise_on()[1], self.narrow
+        pairs, counts = np.unique(self.between[narrow], axis=0, return_counts=True)
+        most = np.argsort(-counts, kind="stable")[:3]
+        for pair in pairs[most]:
+            here = (self.between == pair).all(axis=1)
+            first, second = map(task.mode_name, pair.tolist())
+            left = self.room[here & narrow].min()
+            place = where(task.chart, self.points[here], narrow[here])
+            yield (
+                f"between {first} and {second} nobody can change over safely {place}: "
+                f"{2 * self.eps:g} {unit} of room are needed, and as little as {left:.2g} is left"
+            )
+        if more := len(pairs) - len(most):
+            yield f"nor in places between {counted(more, 'other pair')} of modes"
 
     def _shared(self) -> str:
         """Returns how much of the chart the sets of modes that meet share."""
