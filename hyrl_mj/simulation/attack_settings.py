@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 from typing import Annotated
 
-from hyrl_mj.ranges import Integer, Number, check_fields
+from hyrl_mj.ranges import Checked, Integer, Number
 
 
 @dataclass(frozen=True)
-class AttackSettings:
+class AttackSettings(Checked):
     """What an attack tries, in all stages that attack. No preset changes the defaults.
 
     Attributes:
@@ -36,6 +36,3 @@ class AttackSettings:
     offspring: Annotated[int, Integer(2, 1_000)] = 12
     pieces: Annotated[int, Integer(1, 100)] = 4
     spread: Annotated[float, Number(0, 10, above=True)] = 0.5
-
-    def __post_init__(self) -> None:
-        check_fields(self)

@@ -47,15 +47,15 @@ class Judge(Protocol):
 
     Attributes:
         enough: score with which a training may end.
-        nearly: score with which no training is expected to do better.
+        nearly: score with which no training is expected to do better; none by default.
         settled: share of a training after which scores count.
         noise: noise on the measurements during training.
         margin: noise of so many times the bound has to be survived.
     """
 
     enough: Score
-    nearly: Score
-    settled: float
+    nearly: Score = (np.inf,)
+    settled: float = 0.0
     noise: Noise
     margin: float
 
@@ -66,7 +66,7 @@ class Judge(Protocol):
         """Returns the share that a policy wins, as in `ModeResult`, from what `judge` said of it."""
 
 
-class ByGame:
+class ByGame(Judge):
     """Judges by the worst-case game, which has to be won from every state.
 
     The score is minus the share of lost states, then minus the larger of delay and miss, each as a multiple
@@ -77,8 +77,6 @@ class ByGame:
     """
 
     enough: Score = (0.0, -1.0)
-    nearly: Score = (np.inf,)
-    settled = 0.0
     noise = Noise()  # the game finds the worst
     margin = 1.0
 
@@ -191,7 +189,7 @@ class Episodes:
         return self.states.grid.nearest(self.starts[self.batches[batch]][~won])
 
 
-class ByEpisodes:
+class ByEpisodes(Judge):
     """Judges by noisy episodes, where the worst case cannot be computed.
 
     The score is the number of plays that stop no episode, then minus the share of episodes that the next play
@@ -208,9 +206,6 @@ class ByEpisodes:
     Attributes:
         allowed: allowed distance from the set-point at the end of episodes without noise [chart units].
     """
-
-    nearly: Score = (np.inf,)
-    settled = 0.0
 
     def __init__(
         self,
@@ -255,7 +250,7 @@ class ByEpisodes:
         return 1.0 if not len(judged.lost) else self.episodes.share(policy, self.plays)
 
 
-class ByAttack:
+class ByAttack(Judge):
     """Judges by an attack, too, which finds noise that keeps a robot in a corner: where samples take long.
 
     The score is the mean of two shares: of episodes that are won without noise, and of starts from which an
@@ -267,8 +262,6 @@ class ByAttack:
         attacked: (n, d) starts of the attack. Half of them are where modes meet: there a mode may have to go
             against its neighbours.
     """
-
-    settled = 0.0
 
     def __init__(
         self,
@@ -322,7 +315,7 @@ class ByAttack:
         return min(judged.score[0], share)
 
 
-class ByShare:
+class ByShare(Judge):
     """Judges by the share of noisy episodes that are won, for a task with a reward for each mode.
 
     Such a task is trained from all of its starts, and may draw episodes that no policy wins. The episodes are
@@ -331,7 +324,6 @@ class ByShare:
     """
 
     enough: Score = (1.0,)
-    nearly: Score = (np.inf,)
     settled = 0.75
 
     def __init__(self, states: ModeStates, settings: ModeSettings):

@@ -21,7 +21,7 @@ from hyrl_mj.errors import BadArtifact
 from hyrl_mj.files import artifacts
 from hyrl_mj.judging.game import nearest_of
 from hyrl_mj.learning import TableSettings
-from hyrl_mj.sets import Grid, Nodes
+from hyrl_mj.sets import Grid
 from hyrl_mj.system.progress import progress_bar
 from hyrl_mj.tasks import Outcome, Task
 
@@ -116,12 +116,17 @@ class HeldInputs:
     def from_sets(
         task: Task, extended: ExtendedSets, settings: TableSettings = TableSettings()
     ) -> HeldInputs | None:
-        """Returns these runs, None where no table is `possible`, or the robot takes too long to get away."""
-        grid = extended.sets[0].grid
-        if not possible(task, grid):
+        """Returns these runs, None where no table can be made, or the robot takes too long to get away.
+
+        A table takes a chart of at most two dimensions, at most four inputs or a few levels, and an arrival
+        that ends the episode.
+        """
+        grid, m, inputs = extended.sets[0].grid, len(task.inputs), task.input_levels
+        few = m in VALUES or inputs is not None
+        if not isinstance(grid, Grid) or len(grid.counts) > 2 or not few:
             return None
-        assert isinstance(grid, Grid)
-        m, inputs = len(task.inputs), task.input_levels
+        if not (task.abilities.arrival_ends and task.abilities.restarts):
+            return None
         if inputs is None:
             axes = [np.linspace(a, b, VALUES[m]) for a, b in zip(*task.input_limits, strict=True)]
             inputs = np.array(list(product(*axes)))
@@ -201,22 +206,6 @@ class HeldInputs:
         value = np.where(self.arrived, 0.0, (self._at_ends @ left).reshape(self.arrived.shape))
         lost = self.failed | self.leaves[self.extended.modes.index(mode)]
         return np.where(lost, self.never, value)
-
-
-def possible(task: Task, grid: Nodes) -> bool:
-    """Returns whether a table can be made.
-
-    That takes a chart of at most two dimensions, at most four inputs or a few levels, and an arrival that
-    ends the episode.
-    """
-    few = len(task.inputs) in VALUES or task.input_levels is not None
-    return (
-        isinstance(grid, Grid)
-        and len(grid.counts) <= 2
-        and few
-        and task.abilities.arrival_ends
-        and task.abilities.restarts
-    )
 
 
 def _samples(task: Task, z: np.ndarray, inputs: np.ndarray, away: float, longest: int) -> int:

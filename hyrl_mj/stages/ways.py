@@ -170,15 +170,10 @@ def _complete(modes: np.ndarray, dropped: np.ndarray) -> np.ndarray:
     agree = (~both | (modes == modes[:, None])).all(axis=2)
     groups = networkx.find_cliques(networkx.from_numpy_array(agree))
     all_said = (modes[group].max(axis=0) for group in groups)  # ANY is less than both sides
-    kept = (row for row in all_said if not _says_any(row, dropped))
+    kept = (row for row in all_said if not any(_say_all(row, other) for other in dropped))
     joined = list(islice(kept, MOST_MODES + 1))
     alone = [row for row in modes if not any(_say_all(other, row) for other in joined)]
     return np.unique([*joined, *alone], axis=0)
-
-
-def _says_any(pattern: np.ndarray, others: np.ndarray) -> bool:
-    """Returns whether a pattern (K,) says all that one of others (n, K) says."""
-    return any(_say_all(pattern, other) for other in others)
 
 
 def _say_all(patterns: np.ndarray, other: np.ndarray) -> np.ndarray:

@@ -170,11 +170,6 @@ def square(a: Affine) -> Affine:
     return Affine(a.centre**2 + r * r / 2, 2 * a.centre * a.generators, remainder, a.nan, True)
 
 
-def one(a: Affine) -> Affine:
-    ones = np.ones_like(a.centre)
-    return Affine(ones, np.zeros_like(a.generators), 0 * ones, False, True)
-
-
 def matmul(a: Affine, b: Affine) -> Affine:
     if b.radius.any() and a.radius.any():
         raise Unbounded("multiplies matrices that both depend on the state")

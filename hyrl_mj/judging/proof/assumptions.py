@@ -31,7 +31,8 @@ COMPARED = 1_000
 
 def check_assumptions(task: Task) -> None:
     """Raises `Unbounded` unless all that a proof takes for granted of a task holds."""
-    own = [name for name in DEFAULTS if _is_own(task, name)]
+    methods = {name: getattr(getattr(task, name), "__func__", None) for name in DEFAULTS}
+    own = [name for name, method in methods.items() if method is not getattr(Task, name)]
     model = task.model
     qpos = np.arange(1, model.nq + 1)  # the state begins with the time
     measured = mjcf.state_columns(model)
@@ -56,11 +57,6 @@ def check_assumptions(task: Task) -> None:
         program = program_of(task, name)
         _check_turns(task, name, program)
         _check_program(task, name, program)
-
-
-def _is_own(task: Task, name: str) -> bool:
-    method = getattr(getattr(task, name), "__func__", None)
-    return method is not getattr(Task, name)
 
 
 def _check_turns(task: Task, name: str, program: Program) -> None:

@@ -15,7 +15,6 @@ from hyrl_mj.judging.proof.affine import (
     choose,
     multiply,
     negative,
-    one,
     pair,
     square,
 )
@@ -188,7 +187,6 @@ def raised(a: Affine, b: Affine) -> Affine:
         return sqrt(a)
     if exponent != round(exponent) or not 1 <= abs(exponent) <= 16:
         raise Unbounded(f"uses np.power with the exponent {exponent:g}")
-    power = reduce(multiply, [square(a)] * int(abs(exponent) // 2), one(a))
-    power = multiply(power, a) if exponent % 2 else power
+    power = reduce(multiply, [square(a)] * int(abs(exponent) // 2) + [a] * int(exponent % 2))
     power = replace(power, nan=a.nan | b.nan)  # a power of a number is one, also of 0 or infinity
     return power if exponent > 0 else _reciprocal(power)
