@@ -20,8 +20,8 @@ def critical_points(
     neighbours: tuple[np.ndarray, np.ndarray],
     cell: float,
     resolution: float,
-    eps: float = 0.0,
-    settings: WaySettings = WaySettings(),
+    eps: float,
+    settings: WaySettings,
 ) -> np.ndarray:
     """Searches by outcome: returns middles (N, d) between close starts whose runs go different ways.
 

@@ -42,7 +42,7 @@ class Broken:
 
 
 def find_counterexamples(
-    certificate: Certificate, name: str, controller: Controller, eps: float, seed: int = 0
+    certificate: Certificate, name: str, controller: Controller, eps: float
 ) -> Broken:
     """Attacks a controller where it may lose, and returns where it lost.
 
@@ -57,12 +57,11 @@ def find_counterexamples(
         name: the name of the controller.
         controller: the controller.
         eps: the noise bound.
-        seed: seed of the starts inside of cells.
     """
     game, cells = certificate.game, certificate.cells
     # With one mode the controller cannot pick another one.
     modes = np.array([*(controller.modes if len(controller.modes) > 1 else ()), NOT_STARTED])
-    value, rng = game.value(name, eps), np.random.default_rng(seed)
+    value, rng = game.value(name, eps), np.random.default_rng(0)
     region = game.starts & game.winnable(eps)
     attacked, tried = value[-len(modes) :, :-2] >= NEVER, region
     estimate = game.lattice.estimate or cells is None
