@@ -65,8 +65,6 @@ def worst_case(
             computed with no more than `CURVE_CELLS`; where the game is an estimate it goes through the
             scores, and there are no margins.
     """
-    for eps in bounds:
-        task.check_noise(eps, everywhere)
     Lattice.check(task)
     parts, grid = tuple(parts), lattice_grid(task, cells)
     Lattice.check(task, grid)

@@ -74,7 +74,7 @@ def _across(
     place = np.flatnonzero(works)
     failed = np.flatnonzero(alive & ~works)
     if len(failed):
-        nearest = task.chart.tree(nodes[place]).query(task.chart.in_box(nodes[failed]))[1]
+        _, nearest = task.chart.nearest(nodes[place], nodes[failed])
         stands[failed] = place[nearest]
     first, second = neighbours
     known = alive | works

@@ -229,9 +229,7 @@ class Lattice(Places):
 def nearest_of(grid: Nodes, mask: np.ndarray) -> np.ndarray:
     """Returns the nearest node of a mask (N,) bool to each node: (N,) int."""
     of_mask = np.flatnonzero(mask)
-    return np.asarray(
-        of_mask[grid.chart.tree(grid.nodes[of_mask]).query(grid.chart.in_box(grid.nodes))[1]]
-    )
+    return np.asarray(of_mask[grid.chart.nearest(grid.nodes[of_mask], grid.nodes)[1]])
 
 
 def _ends_well(task: Task) -> bool:

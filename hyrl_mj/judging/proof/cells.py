@@ -195,6 +195,11 @@ class Cells(Places):
         grid = self.lattice.grid
         return np.asarray(grid.chart.low + grid.spacing * (index + 0.5))
 
+    def draw(self, cells: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Returns a chart point inside of each of cells (n,): (n, d)."""
+        off = rng.uniform(-0.5, 0.5, (len(cells), len(self.counts)))
+        return self.middle(cells) + off * self.lattice.grid.spacing
+
 
 def _displacement(lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
     """Returns slope (d, m) and offset (d,) of the displacement as a function of the input."""

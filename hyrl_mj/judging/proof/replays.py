@@ -9,7 +9,7 @@ import numpy as np
 from hyrl_mj.judging.game import NEARLY, NEVER, LostReplay, ReplayCount, Score
 from hyrl_mj.judging.proof.cells import Cells
 from hyrl_mj.judging.proof.certificate import Certificate
-from hyrl_mj.judging.proof.counterexamples import CellNoise
+from hyrl_mj.judging.proof.counterexamples import CellNoise, start_modes
 from hyrl_mj.policies import Controller
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import (
@@ -203,10 +203,8 @@ class _Pool:
         rest = rng.choice(self.counted, n - sum(map(len, weak)))
         places, q0 = np.concatenate([*weak, rest]), np.full(n, self.q0)
         samples = self.samples[places]
-        if self.cells is None:
-            return self.grid.nodes[places], q0, samples
-        off = rng.uniform(-0.5, 0.5, (n, len(self.grid.counts)))
-        return self.cells.middle(places) + off * self.grid.spacing, q0, samples
+        z0 = self.cells.draw(places, rng) if self.cells else self.grid.nodes[places]
+        return z0, q0, samples
 
 
 def _pools(
@@ -217,8 +215,7 @@ def _pools(
     if not region.any():  # a start region thinner than a cell
         cells, region = None, game.starts & game.winnable(eps)
     grid, rng, pools = game.lattice.grid, np.random.default_rng(0), []
-    # With one mode the controller cannot pick another one.
-    modes = [*(controller.modes if len(controller.modes) > 1 else ()), NOT_STARTED]
+    modes = start_modes(controller)
     proved = of == "proved" and cells is not None
     values = (certificate if proved else game).value(name, eps)[:, :-2]
     if cells is not None and not proved:
