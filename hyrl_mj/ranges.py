@@ -2,7 +2,7 @@
 
     samples: Annotated[int, Integer(1, 1_000_000_000)]
 
-`check_fields` applies them where a record is made, also from a file. Pydantic, which reads the files, has
+`Checked` applies them where a record is made, also from a file. Pydantic, which reads the files, has
 ranges, too. But it takes the text "12" and True for integers, or in its strict mode no numbers of NumPy; it
 names neither the value nor the other end of a range; and its import takes a fifth of a second.
 """
@@ -152,14 +152,15 @@ class Instance:
         return value
 
 
-def check_fields(record: Any) -> None:
-    """Checks the fields of a frozen dataclass by their rules, and stores them as plain Python values.
+class Checked:
+    """Base of frozen dataclasses whose fields are checked by their rules, and stored as plain Python values.
 
-    Raises:
-        BadInput: a value is not allowed.
+    To make one raises `BadInput` if a value is not allowed.
     """
-    for name, rule in _rules(type(record)).items():  # type: ignore[arg-type]
-        object.__setattr__(record, name, rule.checked(name, getattr(record, name)))
+
+    def __post_init__(self) -> None:
+        for name, rule in _rules(type(self)).items():
+            object.__setattr__(self, name, rule.checked(name, getattr(self, name)))
 
 
 @cache

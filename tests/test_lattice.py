@@ -160,7 +160,7 @@ def test_a_chart_of_four_dimensions_is_refused():
     cube = Cube(lambda z: z[:, 0], d=4)
     with pytest.raises(BadInput, match=r"1 to 3 dimensions, that of cube has 4.*--episodes"):
         Lattice.tabulate(cube)
-    assert not Lattice.possible(cube)
+    assert Lattice.why_not(cube)
 
 
 def test_a_plant_whose_state_is_more_than_the_chart_is_refused(circle):
@@ -169,17 +169,17 @@ def test_a_plant_whose_state_is_more_than_the_chart_is_refused(circle):
     heavy.model.actuator_biasprm[0, 2] = -1.0  # a weak servo: the pointer's speed matters
     with pytest.raises(BadInput, match=r"unit_circle has a larger state.*--episodes"):
         Lattice.tabulate(heavy)
-    assert not Lattice.possible(heavy)
+    assert Lattice.why_not(heavy)
 
 
 def test_a_measurement_of_more_than_the_chart_is_refused():
     seeing = hyrl_mj.get_task("unit_circle")
     seeing.noisy = (True, True)
-    assert not Lattice.possible(seeing)
+    assert Lattice.why_not(seeing)
 
 
 def test_the_registered_tasks_can_be_played(task):
-    assert Lattice.possible(task)
+    assert Lattice.why_not(task) is None
 
 
 @pytest.mark.parametrize(

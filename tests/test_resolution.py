@@ -194,7 +194,7 @@ def test_nothing_is_proved_of_a_robot_with_an_inner_loop():
 def test_an_inner_loop_with_a_memory_makes_no_kinematic_robot():
     assert Course().kinematic
     assert not Sluggish().kinematic
-    assert not Lattice.possible(Sluggish())
+    assert Lattice.why_not(Sluggish())
 
 
 def test_a_robot_whose_inner_loop_gives_speeds_runs_backward(unicycle):

@@ -9,7 +9,7 @@ from torch import nn
 
 import hyrl_mj
 from hyrl_mj.learning import preset, presets, training
-from hyrl_mj.learning.spread import spread_kinks
+from hyrl_mj.learning.training import spread_kinks
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import pytest
 from environments import Puck, Slid, puck_agent
 from planted import ChartPolicy, spare_environments
 
-from hyrl_mj import BadInput, from_gymnasium
+from hyrl_mj import BadArtifact, from_gymnasium
 from hyrl_mj.judging.game import Lattice, lattice_grid
 from hyrl_mj.judging.worst_case import worst_case
 from hyrl_mj.policies import PolicyController
@@ -19,7 +19,6 @@ from hyrl_mj.stages.grounds import mode_ground
 from hyrl_mj.stages.judges import ByAttack
 from hyrl_mj.stages.retraining import retrain
 from hyrl_mj.stages.tables import (
-    BoundTable,
     HeldInputs,
     TablePolicy,
     _in_reach,
@@ -184,11 +183,12 @@ def test_a_table_leads_back_from_where_noise_shows_the_robot_outside_of_the_set(
 def test_a_table_is_read_as_it_was_written(puck, held, tmp_path):
     table = table_for(held, 1)
     table.save(tmp_path / "mode_0.safetensors")
-    again = TablePolicy.load(tmp_path / "mode_0_table.npz")
+    again = TablePolicy.load(path := tmp_path / "mode_0_table.npz", puck)
     measured = puck.plant(3).measurement
-    np.testing.assert_array_equal(again.bound_to(puck).act(measured), table.act(measured))
-    with pytest.raises(BadInput, match="does not fit"):
-        TablePolicy(again.counts, again.inputs[1:]).bound_to(puck)
+    np.testing.assert_array_equal(again.act(measured), table.act(measured))
+    replace(again, inputs=again.inputs[1:]).save(tmp_path / "mode_0.safetensors")
+    with pytest.raises(BadArtifact, match="does not fit"):
+        TablePolicy.load(path, puck)
 
 
 @pytest.mark.parametrize(
@@ -205,7 +205,7 @@ def test_a_table_is_read_as_it_was_written(puck, held, tmp_path):
 )
 def test_the_best_of_what_is_given_is_taken_and_nothing_is_trained(puck, held, scores, taken):
     """The first that wins all is; without a table the agent, too, and what wins nearly all."""
-    made = BoundTable(puck, held.grid, np.zeros((held.grid.size, 2)))
+    made = TablePolicy(puck, held.grid, np.zeros((held.grid.size, 2)))
 
     class Ground:
         task, mode, enough = puck, 1, (1.0,)

@@ -72,7 +72,9 @@ def test_a_saturated_servo_is_no_direct_one(tmp_path, monkeypatch):
     assert not begins_anew(weak)
     strong = vehicle()._replace(kv=1e6, servo='forcerange="-1e9 1e9"')
     task = task_of(strong, tmp_path, monkeypatch)
-    assert "the forcerange of actuator u" in why_no_cells(task, Grid.with_cells(task.chart, 60))
+    assert "the forcerange of actuator u" in why_no_cells(
+        task, Grid.with_cells(task.chart, 60).counts
+    )
 
 
 @pytest.mark.parametrize(
@@ -100,7 +102,7 @@ def test_an_end_beyond_some_turns_is_told(tmp_path, monkeypatch, turns, wide):
     place = 2 * np.pi * turns + 1
     code = f"ends[np.abs(theta - {place}) < {wide}] = Outcome.CRASHED"
     task = task_of(ends(dial(), code), tmp_path, monkeypatch)
-    why = why_no_cells(task, Grid.with_cells(task.chart, 600))
+    why = why_no_cells(task, Grid.with_cells(task.chart, 600).counts)
     assert "the method ending" in why
     assert "tells whole turns of theta apart" in why
 
@@ -116,7 +118,7 @@ def test_an_end_beyond_some_turns_is_told(tmp_path, monkeypatch, turns, wide):
 )
 def test_code_that_is_the_same_for_all_turns_is_covered(tmp_path, monkeypatch, code):
     task = task_of(ends(dial(), code), tmp_path, monkeypatch)
-    assert why_no_cells(task, Grid.with_cells(task.chart, 600)) is None
+    assert why_no_cells(task, Grid.with_cells(task.chart, 600).counts) is None
 
 
 @pytest.mark.parametrize(

@@ -408,7 +408,7 @@ def examined(seed: int, folder: Path) -> Found:
         policy = policy_of(task)
         grid = Grid.with_cells(task.chart, 600 if task.chart.dimension == 1 else 60)
         wrong = [*_episodes(task, policy, rng)]
-        why = Lattice.why_not(task, grid) or why_no_cells(task, grid)
+        why = Lattice.why_not(task, grid) or why_no_cells(task, grid.counts)
         if why:
             return Found(trap, "estimate", why, tuple(wrong), STARTS)
         loop = PolicyController(policy)

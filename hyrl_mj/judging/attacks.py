@@ -12,6 +12,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -90,7 +91,7 @@ class Attack:
         signal: Recorded,
         quiet: Ends,
         dangerous: int,
-        begun: AttackCount,
+        **search: Any,
     ) -> Attack:
         """Returns the attack of recorded signals, with the arcs under them.
 
@@ -99,7 +100,7 @@ class Attack:
             signal: the signals.
             quiet: how the runs end without noise.
             dangerous: index of the start of the greatest danger.
-            begun: the count, in which the losses are put.
+            search: those fields of the count that the arcs do not tell.
         """
         ends = Ends(
             lost=np.array([arc.outcome != Outcome.REACHED.label for arc in arcs]),
@@ -109,8 +110,10 @@ class Attack:
         lost = ends.lost & ~quiet.lost
         first = int(np.argmin(np.where(lost, ends.time, np.inf)))
         strongest, losses = first if lost.any() else dangerous, int(lost.sum())
-        count = replace(
-            begun,
+        count = AttackCount(
+            **search,
+            eps=signal.bound,
+            starts=len(arcs),
             unaided=int(quiet.lost.sum()),
             lost=losses,
             interval=wilson(losses, int(np.sum(~quiet.lost))),
@@ -124,8 +127,11 @@ class Attack:
         starts = np.array([arc.z[0] for arc in self.arcs])
         arcs = simulate_batch(task, controller, starts, self.signal)
         quiet = ends_of(task, closed_loop(task, controller, starts))
-        begun = replace(self.count, controller=name)
-        return Attack.from_arcs(arcs, self.signal, quiet, self.strongest, begun)
+        count = self.count
+        return Attack.from_arcs(
+            arcs, self.signal, quiet, self.strongest, controller=name, everywhere=count.everywhere,
+            rounds=count.rounds, seconds=count.seconds, samples=count.samples, tried=count.tried,
+        )  # fmt: skip
 
 
 def attack_starts(task: Task, regions: Regions, bound: float, n: int, seed: int) -> np.ndarray:
@@ -236,20 +242,8 @@ def attack(
         # Replays may be longer than an episode, in which alone the attack acts.
         signal = Recorded(search.signals, bound, Programmes.kind, "none", shares)
         arcs = simulate_batch(task, controllers[name], starts, signal)
-        begun = AttackCount(
-            controller=name,
-            eps=bound,
-            everywhere=everywhere,
-            starts=len(starts),
-            unaided=0,
-            lost=0,
-            interval=(0.0, 1.0),
-            rounds=rounds,
-            seconds=budget.seconds,
-            samples=search.samples,
-            tried=dict(search.tried),
-            start=(),
-            outcome="",
-        )
-        found[name] = Attack.from_arcs(arcs, signal, search.quiet, search.most_dangerous, begun)
+        found[name] = Attack.from_arcs(
+            arcs, signal, search.quiet, search.most_dangerous, controller=name, everywhere=everywhere,
+            rounds=rounds, seconds=budget.seconds, samples=search.samples, tried=dict(search.tried),
+        )  # fmt: skip
     return found

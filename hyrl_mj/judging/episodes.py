@@ -134,25 +134,23 @@ def noisy_episodes(
         task.check_noise(noise.bound, noise.everywhere)
     near = max(noise.bound for noise in noises)  # all begin alike
     pairs, firsts = list(product(noises, controllers)), range(0, count, BATCH)
+    sizes = {first: min(BATCH, count - first) for first in firsts}
     judged = math.ceil(JUDGED / len(pairs))
     batches = [
-        _Batch(
-            task, regions, controllers[name], noise, near, seed, first, n, 0 if first else judged
-        )
-        for (noise, name), first in product(pairs, firsts)
-        for n in (min(BATCH, count - first),)
+        (controllers[name], noise, first, n, 0 if first else judged)
+        for (noise, name), (first, n) in product(pairs, sizes.items())
     ]
     # The plants are used again: new ones for each batch would fragment the memory.
-    plants = {} if cores.has_pool() else {n: task.plant(n) for n in {batch.n for batch in batches}}
+    plants = {} if cores.has_pool() else {n: task.plant(n) for n in {*sizes.values()}}
     counts: list[EpisodeCount] = []
     ends: dict[tuple[str, float], dict[str, Ends]] = {}
     with progress_bar(None, "noisy episodes", "episodes", count * len(pairs)) as progress:
-        ended = cores.in_processes(partial(_play, plants), batches)
+        ended = cores.in_processes(partial(_play, plants, task, regions, near, seed), batches)
         for noise, name in pairs:
             played = []
-            for first, batch in zip(firsts, ended):  # noqa: B905 - the next pair goes on
+            for n, batch in zip(sizes.values(), ended):  # noqa: B905 - the next pair goes on
                 played.append(batch)
-                progress.update(min(BATCH, count - first))
+                progress.update(n)
             counts += _count(noise, name, played)
             ends.setdefault((noise.kind, noise.bound), {})[name] = _joined(
                 [batch.ends for batch in played]
@@ -170,24 +168,6 @@ def ends_of(task: Task, run: Rollout) -> Ends:
 
 
 @dataclass(frozen=True)
-class _Batch:
-    """Episodes that are simulated at once: the next `n` after the `first` of one noise and controller.
-
-    What lies near M* is told by the bound `near`; `judged` of them are played once more by plain MuJoCo.
-    """
-
-    task: Task
-    regions: Regions
-    controller: Controller
-    noise: NamedNoise
-    near: float
-    seed: int
-    first: int
-    n: int
-    judged: int = 0
-
-
-@dataclass(frozen=True)
 class _Played:
     """How the episodes of a batch end, the outcome (n,) of each, and which lie in each region, (n,) bool."""
 
@@ -196,15 +176,24 @@ class _Played:
     regions: dict[str, np.ndarray]
 
 
-def _play(plants: Mapping[int, Plant], batch: _Batch) -> _Played:
-    """Plays a batch of episodes."""
-    task, noise, regions, n = batch.task, batch.noise, batch.regions, batch.n
-    seeds = np.random.SeedSequence([batch.seed, batch.first]).generate_state(2)
-    z0 = regions.draw(task, batch.near, n, np.random.default_rng(seeds[0]))
+def _play(
+    plants: Mapping[int, Plant],
+    task: Task,
+    regions: Regions,
+    near: float,
+    seed: int,
+    batch: tuple[Controller, NamedNoise, int, int, int],
+) -> _Played:
+    """Plays episodes at once: the next n after the `first` of one controller and noise.
+
+    What lies near M* is told by the bound `near`; `judged` of them are played once more by plain MuJoCo.
+    """
+    controller, noise, first, n, judged = batch
+    seeds = np.random.SeedSequence([seed, first]).generate_state(2)
+    z0 = regions.draw(task, near, n, np.random.default_rng(seeds[0]))
     plant = plants.get(n) or task.plant(n)
-    judged = batch.judged
     settings = LoopSettings(vary=True, plant=plant, quiet=True, record=judged > 0, states=False)
-    runs = closed_loop(task, batch.controller, z0, noise, seed=int(seeds[1]), settings=settings)
+    runs = closed_loop(task, controller, z0, noise, seed=int(seeds[1]), settings=settings)
     if judged:
         lost_first = np.argsort(runs.outcome == Outcome.REACHED, kind="stable")
         if isinstance(plant, Plant):
@@ -213,7 +202,7 @@ def _play(plants: Mapping[int, Plant], batch: _Batch) -> _Played:
         else:  # every loss of an environment is played again
             rows = lost_first[: max(judged, int((runs.outcome != Outcome.REACHED).sum()))]
             task.verify(z0, runs, rows)
-    return _Played(ends_of(task, runs), runs.outcome, regions.split(task, batch.near, z0))
+    return _Played(ends_of(task, runs), runs.outcome, regions.split(task, near, z0))
 
 
 def _joined(parts: Sequence[Ends]) -> Ends:

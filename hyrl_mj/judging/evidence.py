@@ -8,11 +8,11 @@ from typing import Annotated
 
 from hyrl_mj.judging.game import NEARLY, NO_NOISE, Robustness, wilson
 from hyrl_mj.judging.game.counts import NORMAL_95
-from hyrl_mj.ranges import Integer, Number, check_fields
+from hyrl_mj.ranges import Checked, Integer, Number
 
 
 @dataclass(frozen=True)
-class VerdictSettings:
+class VerdictSettings(Checked):
     """What a verdict asks for: more than the defaults if wanted, never less, or a run could praise itself.
 
     Attributes:
@@ -26,9 +26,6 @@ class VerdictSettings:
     winnable: Annotated[float, Number(0.9, 1)] = 0.9
     episodes: Annotated[int, Integer(1_000, 10**9)] = 1_000
     attacked: Annotated[int, Integer(300, 10**9)] = 300
-
-    def __post_init__(self) -> None:
-        check_fields(self)
 
 
 @dataclass(frozen=True)

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.judging.attacks import Attack, Budget, attack, attack_starts, shown_arcs
+from hyrl_mj.judging.attacks import Budget, attack, attack_starts, shown_arcs
 from hyrl_mj.judging.episodes import NoisyEpisodes, Regions, noisy_episodes
 from hyrl_mj.judging.game import MapClass, Maps, Robustness, compare
 from hyrl_mj.judging.worst_case import worst_case
@@ -160,7 +159,13 @@ def examine(
         return Examination(results, maps)
     starts = options.attack_starts or subject.effort.attack_starts
     z0 = attack_starts(task, regions, eps, starts, options.seed)
-    attacks = _attacks(subject, z0, eps, budget, everywhere, options.seed)
+    # Controllers that answer as the policy does are tried under the signals that were found against it.
+    tried = {n: c for n, c in subject.controllers.items() if n == "policy" or not subject.alike}
+    found = attack(task, tried, z0, eps, budget, everywhere, options.seed, subject.attacks)
+    attacks = {
+        name: found[name] if name in found else found["policy"].on(name, task, controller)
+        for name, controller in subject.controllers.items()
+    }
     quiet = {name: found.quiet for name, found in attacks.items()}
     under = compare("attack", quiet, {name: found.ends for name, found in attacks.items()})
     results = replace(
@@ -177,30 +182,3 @@ def _winnable(subject: Subject, maps: Maps | None) -> tuple[Grid, np.ndarray] | 
         return None
     classes = [*maps.map.values()][-1]  # of the hybrid controller
     return maps.grid(subject.task.chart), ~np.isin(classes, (MapClass.UNWINNABLE, MapClass.OVER))
-
-
-def _attacks(
-    subject: Subject, z0: np.ndarray, eps: float, budget: Budget, everywhere: bool, seed: int
-) -> dict[str, Attack]:
-    """Attacks controllers by name from starts (n, d).
-
-    Where all of them answer as the policy does, they are tried under the signals that were found against it.
-    """
-    task, controllers = subject.task, subject.controllers
-    search = partial(
-        attack,
-        starts=z0,
-        bound=eps,
-        budget=budget,
-        everywhere=everywhere,
-        seed=seed,
-        settings=subject.attacks,
-    )
-    if not subject.alike:
-        return search(task, controllers)
-    alone = {"policy": controllers["policy"]}
-    found = search(task, alone)["policy"]
-    return {
-        name: found if name in alone else found.on(name, task, controller)
-        for name, controller in controllers.items()
-    }

@@ -102,13 +102,14 @@ class Verdict:
             settings: what the words ask for.
         """
         case = _Case(task, bound, robustness, retraining, arrivals, settings)
-        reasons = tuple(case.reasons())
+        reasons, withdrawn = tuple(case.reasons()), [*case.withdrawn()]
+        failures = [*case.failures()]
         for word, grounds in (
-            (Word.PROVED, case.proofs()),
-            (Word.WON if robustness.deciding else Word.HELD, case.success()),
+            (Word.PROVED, case.proved() if case.stands else ()),
+            (Word.WON if robustness.deciding else Word.HELD, case.won() if case.stands else ()),
             (Word.UNDECIDED, case.doubts()),
-            (Word.FAILED, case.failures()),
-            (Word.WEAK, case.weaknesses()),
+            (Word.FAILED, [*withdrawn, *failures] if failures else ()),
+            (Word.WEAK, [*withdrawn, *case.weaknesses()]),
         ):
             if sentence := "; ".join(grounds):
                 return Verdict(word, sentence, reasons)
@@ -184,32 +185,23 @@ class _Case:
 
     @property
     def stands(self) -> bool:
-        """Whether what the game says of HyRL was replayed in MuJoCo, and nothing was lost."""
-        return self.replays is not None and not self.replays.failures
-
-    def proofs(self) -> Iterator[str]:
-        """Yields why the run is PROVED, if it is."""
-        if self.stands:
-            yield from self._proved()
-
-    def success(self) -> Iterator[str]:
-        """Yields why the run is WON or HELD, if it is."""
-        if self.stands or not self.robustness.deciding:
-            yield from self._won()
+        """Whether what the game says of HyRL, if it decides, was replayed in MuJoCo and nothing was lost."""
+        replayed = self.replays is not None and not self.replays.failures
+        return replayed or not self.robustness.deciding
 
     def withdrawn(self) -> Iterator[str]:
         """Yields why the run is neither PROVED nor WON, although the game says so."""
-        if not self.robustness.deciding or self.stands:
+        if self.stands:
             return
         if self.replays:
             yield replays_sentence(self.task, self.replays)
-        elif [*self._proved(), *self._won()]:
+        elif [*self.proved(), *self.won()]:
             yield (
                 "what the worst-case game says of HyRL was not replayed in MuJoCo, which "
                 "hyrl-mj robustness RUN does"
             )
 
-    def _proved(self) -> Iterator[str]:
+    def proved(self) -> Iterator[str]:
         """Yields why the run is PROVED, if the game is to be believed."""
         game = self.robustness.deciding
         if not game or not self.examined or not self.winnable:
@@ -229,7 +221,7 @@ class _Case:
                 )
             yield sentence
 
-    def _won(self) -> Iterator[str]:
+    def won(self) -> Iterator[str]:
         """Yields why the run is WON or HELD, if the game is to be believed."""
         won = self.hyrl.noisy
         if not self.examined or not self.winnable or won is None:
@@ -287,11 +279,6 @@ class _Case:
         return self.winnable >= self.settings.winnable * self.open
 
     def failures(self) -> Iterator[str]:
-        """Yields why the run FAILED, if it did for sure."""
-        if grounds := [*self._failed()]:
-            yield from [*self.withdrawn(), *grounds]
-
-    def _failed(self) -> Iterator[str]:
         """Yields what makes a run a failure, whatever else it does."""
         if not self.winnable:
             yield f"no start is winnable under {self.noise}"
@@ -317,7 +304,6 @@ class _Case:
 
     def weaknesses(self) -> Iterator[str]:
         """Yields why the run is WEAK, if it is."""
-        yield from self.withdrawn()
         if self.arrivals.arrived < NEARLY * self.arrivals.episodes:
             yield f"the policy {self.arrivals}"
         policy, hyrl = self.policy.noisy, self.hyrl.noisy

@@ -2,8 +2,6 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
-from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -30,10 +28,10 @@ from hyrl_mj.judging.game import (
     lattice_grid,
     share,
 )
-from hyrl_mj.judging.proof.cells import decides
+from hyrl_mj.judging.proof.cells import why_no_cells
 from hyrl_mj.judging.proof.certificate import Certificate, Proved
 from hyrl_mj.judging.proof.counterexamples import Broken, find_counterexamples
-from hyrl_mj.judging.proof.replays import Replays, play
+from hyrl_mj.judging.proof.replays import replay
 from hyrl_mj.policies import BLAS, Controller
 from hyrl_mj.sets import GridSet
 from hyrl_mj.simulation import LoopSettings, closed_loop
@@ -67,12 +65,10 @@ def worst_case(
             computed with no more than `CURVE_CELLS`; where the game is an estimate it goes through the
             scores, and there are no margins.
     """
-    for eps in bounds:
-        task.check_noise(eps, everywhere)
     Lattice.check(task)
     parts, grid = tuple(parts), lattice_grid(task, cells)
     Lattice.check(task, grid)
-    exact = decides(task, grid)
+    exact = Lattice.decides(task, grid) and not why_no_cells(task, grid.counts)
     largest = max(*bounds, LARGEST) if exact else max(bounds)
     fine = Game(task, parts, controllers, largest, everywhere, grid)
     names = [*controllers, LIMIT]
@@ -132,15 +128,11 @@ def _replays(
     scores: Mapping[str, tuple[Score, ...]],
 ) -> tuple[ReplayCount, ...]:
     """Plays in MuJoCo what the scores at the largest bound say, and returns what was lost."""
-    plans = [
-        plan
+    counts = (
+        replay(certificate, name, controller, scores[name][-1])
         for name, controller in controllers.items()
-        if (plan := Replays.of_score(certificate, name, controller, scores[name][-1]))
-    ]
-    task, batches = certificate.game.task, [batch for plan in plans for batch in plan.batches]
-    # One after the other: the physics takes all cores, and the rest holds the interpreter's lock.
-    played = map(partial(play, task), progress_bar(batches, "replays", "games", len(batches)))
-    return tuple(plan.count(list(islice(played, len(plan.batches)))) for plan in plans)
+    )
+    return tuple(count for count in counts if count)
 
 
 def _score(certificate: Certificate, name: str, nodes: NodeScore, broken: Broken | None) -> Score:

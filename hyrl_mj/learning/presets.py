@@ -203,7 +203,7 @@ def preset(
         rods=rods,
         resolution=resolution,
         lattice=(_LATTICE_SMOKE if name == "smoke" else LATTICE).get(dimension, 0)
-        if dimension < 3 or Lattice.possible(task)
+        if dimension < 3 or not Lattice.why_not(task)
         else 0,
     )
     settings.check(task)

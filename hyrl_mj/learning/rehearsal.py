@@ -59,7 +59,7 @@ class Rehearsal:
         """Returns the middles (k, d) between neighbours among z (n, d) from which runs go different ways."""
         chart = self._task.chart
         neighbours = 4
-        near = chart.tree(z).query(chart.in_box(z), neighbours + 1)[1][:, 1:]
+        near = chart.nearest(z, z, neighbours + 1)[1][:, 1:]
         first, second = np.repeat(np.arange(len(z)), neighbours), near.ravel()
         part = runs.shows[first] & runs.shows[second] & runs[first].differ(runs[second])
         a, b = z[first[part]], z[second[part]]

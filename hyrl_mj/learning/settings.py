@@ -15,6 +15,7 @@ from hyrl_mj.learning.stage_settings import (
 from hyrl_mj.policies import ACTIVATIONS, ALGORITHMS, Agent, algorithms
 from hyrl_mj.ranges import (
     By,
+    Checked,
     Flag,
     Instance,
     Integer,
@@ -23,7 +24,6 @@ from hyrl_mj.ranges import (
     Optional,
     Several,
     Text,
-    check_fields,
 )
 from hyrl_mj.sets import Grid, covering
 from hyrl_mj.simulation import AttackSettings, Sensor
@@ -36,7 +36,7 @@ CELLS = Integer(2, 10**6)
 
 
 @dataclass(frozen=True)
-class Training:
+class Training(Checked):
     """How SB3 trains one policy. A field beside whose type a rule stands is checked by it.
 
     Attributes:
@@ -92,7 +92,7 @@ class Training:
     options: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        check_fields(self)
+        super().__post_init__()
         if ":" not in self.algorithm and self.algorithm not in ALGORITHMS:
             raise unknown("algorithm", self.algorithm, [*ALGORITHMS, "or module:Class"])
         check_options(self.algorithm, self.options, samples=self.samples, envs=self.envs)
@@ -114,7 +114,7 @@ class Training:
 
 
 @dataclass(frozen=True)
-class Settings:
+class Settings(Checked):
     """All settings of a run; `config.json` holds them.
 
     Attributes:
@@ -165,7 +165,7 @@ class Settings:
     verdict: Annotated[VerdictSettings, Instance((VerdictSettings,))] = VerdictSettings()
 
     def __post_init__(self) -> None:
-        check_fields(self)
+        super().__post_init__()
         if self.stage6.gamma == 1:
             raise BadInput(
                 "stage6.gamma 1.0 cannot be used, because the cost of leaving a mode's set for ever would be "

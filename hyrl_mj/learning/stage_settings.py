@@ -6,13 +6,13 @@ Each field has a unit and a range. The defaults serve all tasks, and no preset c
 from dataclasses import dataclass
 from typing import Annotated
 
-from hyrl_mj.ranges import Integer, Number, Several, check_fields
+from hyrl_mj.ranges import Checked, Integer, Number, Several
 
 _SHARE = Number(0, 1)
 
 
 @dataclass(frozen=True)
-class WaySettings:
+class WaySettings(Checked):
     """How ways are told apart: where they part (stage 2), and which of them are modes (stage 3).
 
     Attributes:
@@ -35,12 +35,9 @@ class WaySettings:
     least_share: Annotated[float, _SHARE] = 0.01
     near_share: Annotated[float, _SHARE] = 0.5
 
-    def __post_init__(self) -> None:
-        check_fields(self)
-
 
 @dataclass(frozen=True)
-class OverlapSettings:
+class OverlapSettings(Checked):
     """How far the parts are extended over M* (stages 4 and 5).
 
     Attributes:
@@ -57,12 +54,9 @@ class OverlapSettings:
     longest: Annotated[float, Number(0, 3_600, above=True)] = 2.0
     patience: Annotated[float, Number(0, 3_600)] = 0.5
 
-    def __post_init__(self) -> None:
-        check_fields(self)
-
 
 @dataclass(frozen=True)
-class ModeSettings:
+class ModeSettings(Checked):
     """Where the policy of a mode is trained, and when it is good enough (stage 6).
 
     Attributes:
@@ -106,12 +100,9 @@ class ModeSettings:
     worth_attacking: Annotated[float, _SHARE] = 0.9
     may_break: Annotated[float, _SHARE] = 0.05
 
-    def __post_init__(self) -> None:
-        check_fields(self)
-
 
 @dataclass(frozen=True)
-class TableSettings:
+class TableSettings(Checked):
     """How a table of inputs is made, in the place of the policy of a mode (stage 6).
 
     Attributes:
@@ -129,6 +120,3 @@ class TableSettings:
     longest: Annotated[int, Integer(1, 10_000)] = 64
     tables: Annotated[int, Integer(1, 100)] = 6
     worst: Annotated[float, _SHARE] = 0.8
-
-    def __post_init__(self) -> None:
-        check_fields(self)

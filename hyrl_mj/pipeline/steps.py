@@ -98,7 +98,7 @@ def extended_sets_stage(run: Run, say: Say) -> None:
     s, task = run.settings, run.task
     points, split, ways = run.critical_set.points, run.partition, None
     if run.agent:
-        if Lattice.possible(task) and Lattice.decides(task, run.lattice_grid):
+        if not Lattice.why_not(task) and Lattice.decides(task, run.lattice_grid):
             lattice = Lattice.tabulate(task, run.lattice_grid)
             ways = Limit.solve(lattice, split)
             split = with_room(task, run.steady, split, ways, s.eps)

@@ -26,7 +26,7 @@ from hyrl_mj.learning import Settings, differing
 from hyrl_mj.policies import Agent, AnyPolicy, HybridController, MlpPolicy, Policy
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import LONGEST, HybridArc
-from hyrl_mj.stages import BoundTable, CriticalSet, ExtendedSets, Partition, PartPolicy, TablePolicy
+from hyrl_mj.stages import CriticalSet, ExtendedSets, Partition, PartPolicy, TablePolicy
 from hyrl_mj.tasks import Task, described_task, get_task, reference
 
 
@@ -146,7 +146,7 @@ class Run:
         """Why the worst-case game, where it can be played, is an estimate; None if it decides."""
         if why := Lattice.why_estimate(self.task):
             return why
-        why = why_no_cells(self.task, self.lattice_grid)
+        why = why_no_cells(self.task, self.lattice_grid.counts)
         return f"the game is an estimate between the nodes, because {why}" if why else None
 
     @property
@@ -192,7 +192,7 @@ class Run:
         return ExtendedSets.load(self._checked("extended_sets.npz"), self.task)
 
     @cached_property
-    def mode_policies(self) -> dict[int, MlpPolicy | PartPolicy | BoundTable]:
+    def mode_policies(self) -> dict[int, MlpPolicy | PartPolicy | TablePolicy]:
         """The policy of each mode, from stage 6."""
         return {q: self._mode_policy(q) for q in self.extended_sets.modes}
 
@@ -314,10 +314,10 @@ class Run:
         """Returns the path of a file, if it is to be believed."""
         return self.manifest.checked(self.path / name)
 
-    def _mode_policy(self, mode: int) -> MlpPolicy | PartPolicy | BoundTable:
+    def _mode_policy(self, mode: int) -> MlpPolicy | PartPolicy | TablePolicy:
         table = self.path / f"mode_{mode}_table.npz"
         if self.manifest.has(table):
-            return TablePolicy.load(self.manifest.checked(table)).bound_to(self.task)
+            return TablePolicy.load(self.manifest.checked(table), self.task)
         path = self.path / f"mode_{mode}_part.json"
         if not self.manifest.has(path):
             return self._load_policy(f"mode_{mode}")

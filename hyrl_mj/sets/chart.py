@@ -137,6 +137,13 @@ class Chart:
         size = np.where(self.periodic, self.scaled_sides, 1e6 * self.scaled_sides)
         return cKDTree(self.in_box(points), boxsize=size)
 
+    def nearest(
+        self, points: np.ndarray, z: np.ndarray, count: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Returns distance and index, (n,) or (n, count), of those of points (N, d) nearest to z (n, d)."""
+        distance, index = self.tree(points).query(self.in_box(z), count)
+        return distance, index
+
     def in_box(self, z: np.ndarray) -> np.ndarray:
         """Returns points (n, d) in the coordinates of `tree`, which are scaled and never negative."""
         inside = self.wrap(z) - self.origin + np.where(self.periodic, 0.0, 1e3 * self.sides)

@@ -78,8 +78,6 @@ class Cloud:
             reach: (d,) how far away the farthest of them lie, along each coordinate.
             cell: how far away the nearest of them lie, in scaled units.
         """
-        if not len(points) or count < 2:
-            return self
         rng, chart = np.random.default_rng(0), self.chart
         chosen = points[rng.permutation(len(points))]
         chosen = chosen[np.arange(max(count // 2, 1)) % len(points)]
@@ -226,13 +224,12 @@ class Cloud:
         sign = np.where(inside, -1.0, 1.0)
         other = np.empty(self.size)  # the distance from the nearest node on the other side
         for side in (inside, ~inside):
-            tree = self.chart.tree(self.nodes[~side])
-            other[side] = tree.query(self.chart.in_box(self.nodes[side]))[0]
+            other[side], _ = self.chart.nearest(self.nodes[~side], self.nodes[side])
         mixed = np.flatnonzero((inside[self._links[1]] != inside[:, None]).any(axis=1))
         value, normal = self._planes(mixed, sign)
         # Other nodes see the plane of the nearest of these.
         if len(mixed):
-            at = self.chart.tree(self.nodes[mixed]).query(self.chart.in_box(self.nodes))[1]
+            _, at = self.chart.nearest(self.nodes[mixed], self.nodes)
             away = self._offsets(self.nodes[mixed[at]], self.nodes)
             depth = sign * (value[at] + (normal[at] * away).sum(axis=1))
         else:

@@ -83,7 +83,7 @@ def distance_to(chart: Chart, points: np.ndarray, z: np.ndarray) -> np.ndarray:
         return np.full(len(z), np.inf)
     if chart.dimension > 3:
         return _surface_distance(chart, points, z)
-    return np.asarray(chart.tree(points).query(chart.in_box(z))[0])
+    return chart.nearest(points, z)[0]
 
 
 def _surface_distance(chart: Chart, points: np.ndarray, z: np.ndarray) -> np.ndarray:

@@ -12,13 +12,13 @@ from typing import Annotated
 import numpy as np
 
 from hyrl_mj.policies import Controller
-from hyrl_mj.ranges import Integer, Number, check_fields
+from hyrl_mj.ranges import Checked, Integer, Number
 from hyrl_mj.simulation.lookahead import Lookahead
 from hyrl_mj.tasks import Task
 
 
 @dataclass(frozen=True)
-class AttackSettings:
+class AttackSettings(Checked):
     """What an attack tries, in all stages that attack. No preset changes the defaults.
 
     Attributes:
@@ -47,9 +47,6 @@ class AttackSettings:
     offspring: Annotated[int, Integer(2, 1_000)] = 12
     pieces: Annotated[int, Integer(1, 100)] = 4
     spread: Annotated[float, Number(0, 10, above=True)] = 0.5
-
-    def __post_init__(self) -> None:
-        check_fields(self)
 
 
 class RuleKind(StrEnum):

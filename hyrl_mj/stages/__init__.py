@@ -16,10 +16,9 @@ from hyrl_mj.stages.partition import (
     part_policy,
     with_room,
 )
-from hyrl_mj.stages.tables import BoundTable, HeldInputs, TableOf, TablePolicy, table_for
+from hyrl_mj.stages.tables import HeldInputs, TableOf, TablePolicy, table_for
 
 __all__ = [
-    "BoundTable",
     "CriticalSet",
     "ExtendedSets",
     "HeldInputs",

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cache, partial
 from typing import ClassVar
 
 import numpy as np
 
-from hyrl_mj.errors import BadInput
+from hyrl_mj.errors import BadInput, counted
 from hyrl_mj.files.artifacts import Saved
 from hyrl_mj.judging.game import Limit, nearest_of
 from hyrl_mj.learning import OverlapSettings
 from hyrl_mj.policies import Policy
 from hyrl_mj.sets import Grid, GridSet, check_points, distance_to
-from hyrl_mj.stages.meeting import least_room, narrow_sentence
+from hyrl_mj.stages.meeting import least_room, where
 from hyrl_mj.stages.partition import (
     Partition,
     check_sets,
@@ -76,13 +76,29 @@ class ExtendedSets(Saved):
             return "one mode, whose set is the whole chart"
         reach = f"T = {self.horizon:.2g} s" if self.horizon else "as far as the ways are open"
         text = f"{len(self.sets)} extended sets, {reach}{self._shared()}"
-        narrow = narrow_sentence(task, self.points, self.between, self.room, self.narrow, self.eps)
-        return f"{text}; {narrow}" if narrow else text
+        return "; ".join([text, *self._narrow_places(task)])
 
     @property
     def narrow(self) -> np.ndarray:
         """Whether the noise needs more room than two modes have at each of the points: (K,) bool."""
         return np.asarray(self.room < 2 * self.eps - self.sets[0].grid.cell)
+
+    def _narrow_places(self, task: Task) -> Iterator[str]:
+        """Yields between which modes nobody can change over in time, and where."""
+        unit, narrow = task.noise_on()[1], self.narrow
+        pairs, counts = np.unique(self.between[narrow], axis=0, return_counts=True)
+        most = np.argsort(-counts, kind="stable")[:3]
+        for pair in pairs[most]:
+            here = (self.between == pair).all(axis=1)
+            first, second = map(task.mode_name, pair.tolist())
+            left = self.room[here & narrow].min()
+            place = where(task.chart, self.points[here], narrow[here])
+            yield (
+                f"between {first} and {second} nobody can change over safely {place}: "
+                f"{2 * self.eps:g} {unit} of room are needed, and as little as {left:.2g} is left"
+            )
+        if more := len(pairs) - len(most):
+            yield f"nor in places between {counted(more, 'other pair')} of modes"
 
     def _shared(self) -> str:
         """Returns how much of the chart the sets of modes that meet share."""
@@ -135,132 +151,77 @@ def extend(
         settings: when a horizon is long enough, and what is a gap.
     """
     points = check_points(task.chart, points, task.name)
-    case = _Case(task, policy, points, partition, eps, horizon, settings)
-    winning = case.winning() if ways is None else open_ways(ways, partition.grid)
-    roomy = case.trim(winning)
-    if ways is None or horizon is not None:
-        reached, propagated = case.reach(roomy)
-    else:
-        reached, propagated = case.wanted, 0.0
-    rows, pair, room = least_room(case.points, case.parts, winning, case.eps)
-    return ExtendedSets(
-        partition.modes,
-        case.widen(reached, roomy),
-        winning,
-        propagated,
-        eps,
-        case.points[rows],
-        2 * eps * room,
-        np.array(partition.modes)[pair],
+    grid, parts = partition.grid, partition.parts
+    noise, hop = task.noise_in_chart(eps), longest_hop(task, policy, grid)
+    near = neighbourhood(partition, eps, hop)
+    pis = part_policies(task, policy, partition, near)
+    # Each part with 2 eps and one sample around it.
+    by = 2 * noise + hop * (task.noise_in_chart(1.0) > 0)
+    wanted = [part.dilated_by_box(by) for part in parts]
+    # The extended sets lie among these candidates.
+    radius = 3 * eps + near + (0.0 if horizon is None else horizon / task.dt * near)
+    candidates = [part.dilated(radius).mask for part in parts]
+    off = distance_to(task.chart, points, grid.nodes)
+    rims = [part.mask & (off <= near) for part in parts]
+    # The cells that backward runs visit are those of a grid.
+    backward = task.kinematic and isinstance(grid, Grid)
+    longest = round(settings.longest / task.dt)
+
+    @cache
+    def told(i: int) -> np.ndarray:
+        """Returns what runs from outside of a part tell: from where its way succeeds, and when they enter."""
+        rim = None if backward else rims[i]
+        tell = partial(runs_from_outside, task, pis[i], partition, parts[i], rim, longest)
+        return refined(task, grid, candidates[i] & ~parts[i].mask, points, radius, tell, 2)
+
+    nowhere = np.zeros(grid.size, dtype=bool)
+    walls = ~task.goes_on(grid.nodes) if task.abilities.stopped_by_walls else nowhere
+    winning = (
+        tuple((partition.succeeds & p.mask) | (told(i)[:, 0] > 0) for i, p in enumerate(parts))
+        if ways is None
+        else open_ways(ways, grid)
     )
-
-
-class _Case:
-    """What is extended, step by step; the arguments are those of `extend`.
-
-    Attributes:
-        eps, hop: (d,) the noise, and the longest hop in one sample, along each coordinate.
-        wanted: each part with 2 eps and one sample around it.
-        around: (N,) bool, the nodes so near to M* that they have to be covered: where parts meet elsewhere,
-            as at the set-point, nothing is left to decide.
-        walls: (N,) bool, the nodes in walls that only stop the robot.
-    """
-
-    def __init__(
-        self,
-        task: Task,
-        policy: Policy,
-        points: np.ndarray,
-        partition: Partition,
-        eps: float,
-        horizon: float | None,
-        settings: OverlapSettings,
-    ):
-        self.task, self.points, self.partition = task, points, partition
-        self.horizon, self.settings = horizon, settings
-        self.grid, self.parts = partition.grid, partition.parts
-        self.eps, self.hop = task.noise_in_chart(eps), longest_hop(task, policy, self.grid)
-        near = neighbourhood(partition, eps, self.hop)
-        self._pis = part_policies(task, policy, partition, near)
-        by = 2 * self.eps + self.hop * (task.noise_in_chart(1.0) > 0)
-        self.wanted = [part.dilated_by_box(by) for part in self.parts]
-        # The extended sets lie among these candidates.
-        radius = 3 * eps + near + (0.0 if horizon is None else horizon / task.dt * near)
-        self._candidates = [part.dilated(radius).mask for part in self.parts]
-        off = distance_to(task.chart, points, self.grid.nodes)
-        self.around = off <= float(np.linalg.norm((2 * self.eps + self.hop) / task.chart.scale))
-        # The cells that backward runs visit are those of a grid.
-        self._backward = task.kinematic and isinstance(self.grid, Grid)
-        self._rims = [part.mask & (off <= near) for part in self.parts]
-        longest = round(settings.longest / task.dt)
-        # The same runs from outside of a part tell from where its way succeeds, and when they enter the part.
-        self._told = [
-            cache(partial(
-                refined, task, self.grid, candidate & ~part.mask, points, radius,
-                partial(
-                    runs_from_outside, task, pi, partition, part,
-                    None if self._backward else rim, longest,
-                ), 2,
-            ))
-            for pi, part, rim, candidate in zip(
-                self._pis, self.parts, self._rims, self._candidates, strict=True
-            )
-        ]  # fmt: skip
-        nowhere = np.zeros(self.grid.size, dtype=bool)
-        self.walls = ~task.goes_on(self.grid.nodes) if task.abilities.stopped_by_walls else nowhere
-
-    def winning(self) -> tuple[np.ndarray, ...]:
-        """Returns W_i, the nodes (N,) bool from which the policy of a part arrives by its own way."""
-        return tuple(
-            (self.partition.succeeds & part.mask) | (known()[:, 0] > 0)
-            for part, known in zip(self.parts, self._told, strict=True)
-        )
-
-    def trim(self, winning: Sequence[np.ndarray]) -> list[GridSet]:
-        """Returns W_i (N,) bool with room for the noise.
-
-        Noise that shows the robot in a wall that only stops it does not show it where its mode fails.
-        """
-        return [
-            GridSet.from_mask(self.grid, wins | ~candidate | self.walls).eroded_by_box(self.eps)
-            for wins, candidate in zip(winning, self._candidates, strict=True)
-        ]
-
-    def reach(self, roomy: Sequence[GridSet]) -> tuple[list[GridSet], float]:
-        """Returns M_i u X_i, and the time T of the propagation [s]."""
-        if len(self.parts) < 2:
-            return (self.wanted if self.horizon is None else [*self.parts]), self.horizon or 0.0
+    # W_i with room for the noise. Noise that shows the robot in a wall that only stops it does not show it
+    # where its mode fails.
+    roomy = [
+        GridSet.from_mask(grid, wins | ~candidate | walls).eroded_by_box(noise)
+        for wins, candidate in zip(winning, candidates, strict=True)
+    ]
+    reached, propagated = wanted, horizon or 0.0
+    if len(parts) < 2:
+        reached = wanted if horizon is None else [*parts]
+    elif ways is None or horizon is not None:
         within = [
-            backward_reach(self.task, pi, part, rim, self.settings.gap)
-            if self._backward
-            else forward_reach(part, known()[:, 2])
-            for pi, part, rim, known in zip(
-                self._pis, self.parts, self._rims, self._told, strict=True
-            )
+            backward_reach(task, pi, part, rim, settings.gap)
+            if backward
+            else forward_reach(part, told(i)[:, 2])
+            for i, (pi, part, rim) in enumerate(zip(pis, parts, rims, strict=True))
         ]
+        # Nodes near to M* have to be covered: where parts meet elsewhere, as at the set-point, nothing is
+        # left to decide.
+        around = off <= float(np.linalg.norm((2 * noise + hop) / task.chart.scale))
         goals = [
-            (w & room).mask & ~part.mask & self.around
-            for w, room, part in zip(self.wanted, roomy, self.parts, strict=True)
+            (w & room).mask & ~part.mask & around
+            for w, room, part in zip(wanted, roomy, parts, strict=True)
         ]
-        given = max(round(self.horizon / self.task.dt), 1) if self.horizon else None
-        k = given or shortest(self.task, within, goals, self.settings)
-        reached = [part | reach(k) for part, reach in zip(self.parts, within, strict=True)]
-        if self.horizon is None:
-            reached = [r & w for r, w in zip(reached, self.wanted, strict=True)]
-        return reached, self.horizon or k * self.task.dt
-
-    def widen(self, reached: Sequence[GridSet], roomy: Sequence[GridSet]) -> tuple[GridSet, ...]:
-        """Returns M_ext_i.
-
-        With inertia a run goes on for a sample before the new mode tells: chattering would cross a set that
-        is just as wide as the noise.
-        """
-        wide = self.eps if self.task.kinematic else self.eps + self.hop * (self.eps > 0)
-        sets = tuple(
-            (r & room) | part.dilated_by_box(wide)
-            for r, room, part in zip(reached, roomy, self.parts, strict=True)
-        )
-        if self.walls.any():  # where noise shows the robot in a wall, it is beside it
-            beside = nearest_of(self.grid, ~self.walls)
-            sets = tuple(GridSet.from_mask(self.grid, own.mask[beside]) for own in sets)
-        return sets
+        given = max(round(horizon / task.dt), 1) if horizon else None
+        k = given or shortest(task, within, goals, settings)
+        reached = [part | reach(k) for part, reach in zip(parts, within, strict=True)]
+        if horizon is None:
+            reached = [r & w for r, w in zip(reached, wanted, strict=True)]
+        propagated = horizon or k * task.dt
+    # With inertia a run goes on for a sample before the new mode tells: chattering would cross a set that is
+    # just as wide as the noise.
+    wide = noise if task.kinematic else noise + hop * (noise > 0)
+    sets = tuple(
+        (r & room) | part.dilated_by_box(wide)
+        for r, room, part in zip(reached, roomy, parts, strict=True)
+    )
+    if walls.any():  # where noise shows the robot in a wall, it is beside it
+        beside = nearest_of(grid, ~walls)
+        sets = tuple(GridSet.from_mask(grid, own.mask[beside]) for own in sets)
+    rows, pair, room = least_room(points, parts, winning, noise)
+    between = np.array(partition.modes)[pair]
+    return ExtendedSets(
+        partition.modes, sets, winning, propagated, eps, points[rows], 2 * eps * room, between
+    )

@@ -56,15 +56,15 @@ class Judge(Protocol):
 
     Attributes:
         enough: score with which a training may end.
-        nearly: score with which no training is expected to do better.
+        nearly: score with which no training is expected to do better; none by default.
         settled: share of a training after which scores count.
         noise: noise on the measurements during training.
         margin: noise of so many times the bound has to be survived.
     """
 
     enough: Score
-    nearly: Score
-    settled: float
+    nearly: Score = (np.inf,)
+    settled: float = 0.0
     noise: Noise
     margin: float
 
@@ -75,7 +75,7 @@ class Judge(Protocol):
         """Returns the share that a policy wins, as in `ModeResult`, from what `judge` said of it."""
 
 
-class ByGame:
+class ByGame(Judge):
     """Judges by the worst-case game, which has to be won from every state.
 
     The score is minus the share of lost states, then minus the larger of delay and miss, each as a multiple
@@ -86,8 +86,6 @@ class ByGame:
     """
 
     enough: Score = (0.0, -1.0)
-    nearly: Score = (np.inf,)
-    settled = 0.0
     noise = Noise()  # the game finds the worst
     margin = 1.0
 
@@ -242,7 +240,7 @@ class Attacked:
         return found.quiet.lost | found.ends.lost
 
 
-class ByEpisodes:
+class ByEpisodes(Judge):
     """Judges by noisy episodes and an attack, where the worst case cannot be computed.
 
     The score is the number of plays that stop no episode, then minus the share of episodes that the next play
@@ -261,9 +259,6 @@ class ByEpisodes:
     Attributes:
         allowed: allowed distance from the set-point at the end of episodes without noise [chart units].
     """
-
-    nearly: Score = (np.inf,)
-    settled = 0.0
 
     def __init__(
         self,
@@ -320,7 +315,7 @@ class ByEpisodes:
         return self.episodes.share(policy, self.plays)
 
 
-class ByAttack:
+class ByAttack(Judge):
     """Judges by an attack first, which finds noise that keeps a robot in a corner: where samples take long.
 
     The score is the mean of two shares: of episodes that are won without noise, and of starts from which an
@@ -328,8 +323,6 @@ class ByAttack:
     policy that wins too few of the first is not attacked, as if it were broken from everywhere. The attack
     stands for the adversary of the episodes, whose looking ahead takes too long here.
     """
-
-    settled = 0.0
 
     def __init__(self, attacked: Attacked, settings: ModeSettings, policy: Policy | None):
         self.attacked, self.settings = attacked, settings
@@ -360,7 +353,7 @@ class ByAttack:
         return min(judged.score[0], share)
 
 
-class ByShare:
+class ByShare(Judge):
     """Judges by the share of noisy episodes that are won, for a task with a reward for each mode.
 
     Such a task is trained from all of its starts, and may draw episodes that no policy wins. The episodes are
@@ -369,7 +362,6 @@ class ByShare:
     """
 
     enough: Score = (1.0,)
-    nearly: Score = (np.inf,)
     settled = 0.75
 
     def __init__(self, states: ModeStates, settings: ModeSettings):

@@ -1,4 +1,4 @@
-"""Where on M* which modes meet, how much room there is for noise, and what to say of a lack of it."""
+"""Where on M* which modes meet, and how much room there is for noise."""
 
 from __future__ import annotations
 
@@ -7,9 +7,7 @@ from itertools import product
 
 import numpy as np
 
-from hyrl_mj.errors import counted
 from hyrl_mj.sets import Chart, Cloud, GridSet, Nodes
-from hyrl_mj.tasks import Task
 
 # The room is found to this share of what the noise needs.
 STEP = 0.02
@@ -108,44 +106,7 @@ def least_room(
     return rows, pair, np.take_along_axis(best, pair, axis=1).min(axis=1)
 
 
-def narrow_sentence(
-    task: Task,
-    points: np.ndarray,
-    between: np.ndarray,
-    room: np.ndarray,
-    narrow: np.ndarray,
-    eps: float,
-) -> str:
-    """Returns between which modes nobody can change over in time, and where; "" if that is nowhere.
-
-    Args:
-        task: names the modes.
-        points: (N, d) of M*.
-        between: (N, 2) the numbers of two modes that meet there.
-        room: (N,) that they have, in the unit of the noise.
-        narrow: (N,) bool, whether the noise needs more.
-        eps: bound of the noise.
-    """
-    if not narrow.any():
-        return ""
-    unit = task.noise_on()[1]
-    pairs, counts = np.unique(between[narrow], axis=0, return_counts=True)
-    said = []
-    for pair in pairs[np.argsort(-counts, kind="stable")][:3]:
-        here = (between == pair).all(axis=1)
-        first, second = map(task.mode_name, pair.tolist())
-        left = room[here & narrow].min()
-        place = _where(task.chart, points[here], narrow[here])
-        said.append(
-            f"between {first} and {second} nobody can change over safely {place}: "
-            f"{2 * eps:g} {unit} of room are needed, and as little as {left:.2g} is left"
-        )
-    if more := len(pairs) - len(said):
-        said.append(f"nor in places between {counted(more, 'other pair')} of modes")
-    return "; ".join(said)
-
-
-def _where(chart: Chart, points: np.ndarray, narrow: np.ndarray) -> str:
+def where(chart: Chart, points: np.ndarray, narrow: np.ndarray) -> str:
     """Returns the place of the narrow (N,) ones of points (N, d): "from x = 0.4 m on"."""
     if narrow.all():
         return f"at all of {ranges(chart, points, 1e-3)}"

@@ -31,7 +31,7 @@ class ModeStates:
         early: (k,) those of them where an episode may start; all if there are none.
     """
 
-    def __init__(self, task: Task, extended: ExtendedSets, mode: int, anywhere: bool = False):
+    def __init__(self, task: Task, extended: ExtendedSets, mode: int, anywhere: bool):
         self.task, self.extended, self.mode = task.for_mode(mode), extended, mode
         self.rewarded = self.task is not task
         self.shares = tuple(float(share) for share in self.task.noisy)

@@ -175,7 +175,7 @@ def make_partition(
     members, succeeds = known[:, :-2], known[:, -1]
     works, failed = np.flatnonzero(known[:, -2]), np.flatnonzero(~known[:, -2])
     if modes and len(failed):
-        nearest = task.chart.tree(grid.nodes[works]).query(task.chart.in_box(grid.nodes[failed]))[1]
+        _, nearest = task.chart.nearest(grid.nodes[works], grid.nodes[failed])
         members[failed] = members[works[nearest]]
     masks = members.T if modes else np.ones((1, len(grid.nodes)), dtype=bool)
     parts = tuple(GridSet.from_mask(grid, mask) for mask in masks)

@@ -14,10 +14,10 @@ from hyrl_mj.learning.training import Score, train
 from hyrl_mj.policies import ALGORITHMS, MlpPolicy, Policy
 from hyrl_mj.stages.grounds import ModeGround
 from hyrl_mj.stages.partition import Partition, PartPolicy, part_policy
-from hyrl_mj.stages.tables import BoundTable, TableOf
+from hyrl_mj.stages.tables import TableOf, TablePolicy
 
 # The policy of a mode: a trained network, pi_i, or a table.
-ModePolicy = MlpPolicy | PartPolicy | BoundTable
+ModePolicy = MlpPolicy | PartPolicy | TablePolicy
 # Returns the policy that the first attempt continues from, by the ground of the mode, settings and a seed.
 WarmStart = Callable[["ModeGround", Training, int], MlpPolicy | None]
 
@@ -135,6 +135,6 @@ def _result(ground: ModeGround, policy: ModePolicy, trainings: int) -> ModeResul
     kind: Kind = "trained"
     if isinstance(policy, PartPolicy):
         kind = "agent" if policy.whole else "pi_i"
-    elif isinstance(policy, BoundTable):
+    elif isinstance(policy, TablePolicy):
         kind = "table"
     return ModeResult(ground.mode, ground.won(policy), trainings, kind)

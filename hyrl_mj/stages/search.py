@@ -20,8 +20,8 @@ def critical_points(
     neighbours: tuple[np.ndarray, np.ndarray],
     cell: float,
     resolution: float,
-    eps: float = 0.0,
-    settings: WaySettings = WaySettings(),
+    eps: float,
+    settings: WaySettings,
 ) -> np.ndarray:
     """Searches by outcome: returns middles (N, d) between close starts whose runs go different ways.
 
@@ -74,7 +74,7 @@ def _across(
     place = np.flatnonzero(works)
     failed = np.flatnonzero(alive & ~works)
     if len(failed):
-        nearest = task.chart.tree(nodes[place]).query(task.chart.in_box(nodes[failed]))[1]
+        _, nearest = task.chart.nearest(nodes[place], nodes[failed])
         stands[failed] = place[nearest]
     first, second = neighbours
     known = alive | works

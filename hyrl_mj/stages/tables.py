@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from hyrl_mj.errors import BadInput
-from hyrl_mj.files.artifacts import Saved
+from hyrl_mj.errors import BadArtifact
+from hyrl_mj.files import artifacts
 from hyrl_mj.judging.game import nearest_of
 from hyrl_mj.learning import TableSettings
-from hyrl_mj.sets import Grid, Nodes
+from hyrl_mj.sets import Grid
 from hyrl_mj.system.progress import progress_bar
 from hyrl_mj.tasks import Outcome, Task
 
@@ -39,40 +39,16 @@ ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
-class TablePolicy(Saved):
+class TablePolicy:
     """Inputs at the nodes of a grid; between the nodes they are interpolated, or those of the nearest node.
 
     Attributes:
-        counts: (d,) number of nodes along each coordinate of the chart.
+        task: gives the chart.
+        grid: the nodes.
         inputs: (N, m).
     """
 
     KIND: ClassVar[str] = "table policy"
-
-    counts: np.ndarray
-    inputs: np.ndarray
-
-    def bound_to(self, task: Task) -> BoundTable:
-        """Returns the policy on the chart of a task.
-
-        Raises:
-            BadInput: the table does not fit the task.
-        """
-        if (
-            len(self.counts) != task.chart.dimension
-            or self.inputs.shape != (np.prod(self.counts), len(task.inputs))
-            or not np.isfinite(self.inputs).all()
-        ):
-            raise BadInput(
-                f"a table of inputs {self.inputs.shape} does not fit {task.name}: run hyrl-mj retrain RUN "
-                "to write it again"
-            )
-        return BoundTable(task, Grid.from_counts(task.chart, self.counts), self.inputs)
-
-
-@dataclass(frozen=True)
-class BoundTable:
-    """A `TablePolicy` on the chart of a task."""
 
     task: Task
     grid: Grid
@@ -87,8 +63,25 @@ class BoundTable:
 
     def save(self, path: Path) -> None:
         """Writes `<stem>_table.npz` beside a path."""
-        table = TablePolicy(np.array(self.grid.counts), self.inputs)
-        table.save(path.with_name(f"{path.stem}_table.npz"))
+        arrays = {"counts": np.array(self.grid.counts), "inputs": self.inputs}
+        artifacts.write_arrays(path.with_name(f"{path.stem}_table.npz"), arrays, self.KIND)
+
+    @staticmethod
+    def load(path: Path, task: Task) -> TablePolicy:
+        """Reads what `save` wrote.
+
+        Raises:
+            BadArtifact: the file is missing, damaged, or does not fit the task.
+        """
+        arrays = artifacts.read_arrays(path, TablePolicy.KIND)
+        with artifacts.reading(path):
+            grid, inputs = Grid.from_counts(task.chart, arrays["counts"]), arrays["inputs"]
+            if inputs.shape != (grid.size, len(task.inputs)) or not np.isfinite(inputs).all():
+                raise BadArtifact(
+                    f"a table of inputs {inputs.shape} does not fit {task.name}: run hyrl-mj retrain RUN to "
+                    "write it again"
+                )
+        return TablePolicy(task, grid, inputs)
 
 
 @dataclass(frozen=True)
@@ -123,12 +116,17 @@ class HeldInputs:
     def from_sets(
         task: Task, extended: ExtendedSets, settings: TableSettings = TableSettings()
     ) -> HeldInputs | None:
-        """Returns these runs, None where no table is `possible`, or the robot takes too long to get away."""
-        grid = extended.sets[0].grid
-        if not possible(task, grid):
+        """Returns these runs, None where no table can be made, or the robot takes too long to get away.
+
+        A table takes a chart of at most two dimensions, at most four inputs or a few levels, and an arrival
+        that ends the episode.
+        """
+        grid, m, inputs = extended.sets[0].grid, len(task.inputs), task.input_levels
+        few = m in VALUES or inputs is not None
+        if not isinstance(grid, Grid) or len(grid.counts) > 2 or not few:
             return None
-        assert isinstance(grid, Grid)
-        m, inputs = len(task.inputs), task.input_levels
+        if not (task.abilities.arrival_ends and task.abilities.restarts):
+            return None
         if inputs is None:
             axes = [np.linspace(a, b, VALUES[m]) for a, b in zip(*task.input_limits, strict=True)]
             inputs = np.array(list(product(*axes)))
@@ -210,22 +208,6 @@ class HeldInputs:
         return np.where(lost, self.never, value)
 
 
-def possible(task: Task, grid: Nodes) -> bool:
-    """Returns whether a table can be made.
-
-    That takes a chart of at most two dimensions, at most four inputs or a few levels, and an arrival that
-    ends the episode.
-    """
-    few = len(task.inputs) in VALUES or task.input_levels is not None
-    return (
-        isinstance(grid, Grid)
-        and len(grid.counts) <= 2
-        and few
-        and task.abilities.arrival_ends
-        and task.abilities.restarts
-    )
-
-
 def _samples(task: Task, z: np.ndarray, inputs: np.ndarray, away: float, longest: int) -> int:
     """Returns after how many samples a held input usually has led away far enough, 0 if beyond the longest.
 
@@ -245,7 +227,7 @@ def _samples(task: Task, z: np.ndarray, inputs: np.ndarray, away: float, longest
     return 0
 
 
-def table_for(held: HeldInputs, mode: int) -> BoundTable:
+def table_for(held: HeldInputs, mode: int) -> TablePolicy:
     """Returns the policy of a mode: at each node the input that does well wherever noise may hide the robot.
 
     The measure of an input at a node is how many samples farther from arrival it leads, at the worst and on
@@ -270,7 +252,7 @@ def table_for(held: HeldInputs, mode: int) -> BoundTable:
         left = _left(held, mode, _under_noise(held, table))
         tables.append((float(left[own].mean()), table))
     _, table = min(tables, key=lambda made: made[0])
-    return BoundTable(held.task, held.grid, held.inputs[table])
+    return TablePolicy(held.task, held.grid, held.inputs[table])
 
 
 def _left(held: HeldInputs, mode: int, follow: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
@@ -350,4 +332,4 @@ def _in_reach(
 
 
 # Returns the table of a mode.
-TableOf = Callable[[int], BoundTable]
+TableOf = Callable[[int], TablePolicy]

@@ -93,10 +93,7 @@ class HomotopyClasses:
                     half[k] = min(half[k], least)
             seen = sides(_angles(passing, end), half)[counted]
             decides = (seen == LEFT).any(axis=0) & (seen == RIGHT).any(axis=0)
-        found = HomotopyClasses(
-            np.empty((0, len(decides)), dtype=int), (), (), end, half, decides, True
-        )
-        patterns = found.of_runs(runs)[counted]
+        patterns = _patterns(runs, end, half, decides)[counted]
         kept, dropped = _modes(patterns, settings.least_share * runs.alive.sum())
         if len(kept):
             kept = _complete(kept, dropped)
@@ -113,14 +110,6 @@ class HomotopyClasses:
         modes, gone = (tuple(int(q) for q in values) for values in (numbers[0][order], numbers[1]))
         return HomotopyClasses(kept[order], modes, gone, end, half, decides, runs.arriving)
 
-    def of_runs(self, runs: WayRuns) -> np.ndarray:
-        """Returns the patterns (n, K) of runs."""
-        if runs.direction is not None:
-            return runs.direction[:, None]
-        assert runs.passing is not None
-        angle = _angles(runs.passing, self.end)
-        return np.where(self.decides, sides(angle, self.half), ANY)
-
     def works(self, runs: WayRuns) -> np.ndarray:
         """Returns the runs (n,) bool that show the way of a mode, or nothing to decide."""
         shows = runs.shows if self.arriving else runs.stable
@@ -128,9 +117,17 @@ class HomotopyClasses:
 
     def members(self, runs: WayRuns) -> np.ndarray:
         """Returns the modes that runs belong to: (n, Q) bool, none for runs of a way that is no mode."""
-        patterns = self.of_runs(runs)[:, None]
+        patterns = _patterns(runs, self.end, self.half, self.decides)[:, None]
         agree = (patterns == self.patterns) | (patterns == ANY) | (self.patterns == ANY)
         return np.asarray(agree.all(axis=2))
+
+
+def _patterns(runs: WayRuns, end: np.ndarray, half: np.ndarray, decides: np.ndarray) -> np.ndarray:
+    """Returns the patterns (n, K) of runs, with `end`, `half` and `decides` as in `HomotopyClasses`."""
+    if runs.direction is not None:
+        return runs.direction[:, None]
+    assert runs.passing is not None
+    return np.where(decides, sides(_angles(runs.passing, end), half), ANY)
 
 
 def _angles(passing: Passing, end: np.ndarray) -> np.ndarray:
@@ -170,15 +167,10 @@ def _complete(modes: np.ndarray, dropped: np.ndarray) -> np.ndarray:
     agree = (~both | (modes == modes[:, None])).all(axis=2)
     groups = networkx.find_cliques(networkx.from_numpy_array(agree))
     all_said = (modes[group].max(axis=0) for group in groups)  # ANY is less than both sides
-    kept = (row for row in all_said if not _says_any(row, dropped))
+    kept = (row for row in all_said if not any(_say_all(row, other) for other in dropped))
     joined = list(islice(kept, MOST_MODES + 1))
     alone = [row for row in modes if not any(_say_all(other, row) for other in joined)]
     return np.unique([*joined, *alone], axis=0)
-
-
-def _says_any(pattern: np.ndarray, others: np.ndarray) -> bool:
-    """Returns whether a pattern (K,) says all that one of others (n, K) says."""
-    return any(_say_all(pattern, other) for other in others)
 
 
 def _say_all(patterns: np.ndarray, other: np.ndarray) -> np.ndarray:

@@ -4,7 +4,6 @@ The plant is tabulated on a lattice of states, and the game is solved on it by b
 `Game` scores controllers on the nodes, and `Limit` is what a split of the states could win.
 """
 
-from hyrl_mj.judging.game.adversary import WorstNoise
 from hyrl_mj.judging.game.counts import (
     LATE,
     NO_NOISE,
@@ -17,7 +16,7 @@ from hyrl_mj.judging.game.counts import (
     compare,
     wilson,
 )
-from hyrl_mj.judging.game.lattice import EPISODES_INSTEAD, Lattice, nearest_of
+from hyrl_mj.judging.game.lattice import EPISODES_INSTEAD, Lattice, Places, nearest_of
 from hyrl_mj.judging.game.limit import Limit, fewest_samples
 from hyrl_mj.judging.game.resolution import (
     CURVE_CELLS,
@@ -48,7 +47,6 @@ from hyrl_mj.judging.game.solver import (
     NEVER,
     Answers,
     Moves,
-    Places,
     lasting,
     noisy_moves,
     solve,
@@ -89,7 +87,6 @@ __all__ = [
     "Robustness",
     "Score",
     "WinningShares",
-    "WorstNoise",
     "aligned_cells",
     "compare",
     "curve_grid",

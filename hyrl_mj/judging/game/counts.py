@@ -275,11 +275,9 @@ class ReplayCount:
     @property
     def shares(self) -> tuple[float, float]:
         """The shares of the starts that were not lost without noise, and under noise; 1 of no starts."""
-        quiet, noisy = ([k for k in self.starts if (k == "none") == none] for none in (True, False))
-        lost = (sum(self.lost[k] for k in kinds) for kinds in (quiet, noisy))
-        played = (sum(self.starts[k] for k in kinds) for kinds in (quiet, noisy))
-        without, under = (1 - x / max(n, 1) for x, n in zip(lost, played, strict=True))
-        return without, under
+        lost, played = (counts.get(NO_NOISE, 0) for counts in (self.lost, self.starts))
+        noisy = 1 - (self.failures - lost) / max(self.played - played, 1)
+        return 1 - lost / max(played, 1), noisy
 
     @property
     def is_whole(self) -> bool:

@@ -34,14 +34,41 @@ EPISODES_INSTEAD = (
 
 
 @dataclass(frozen=True)
-class Lattice:
+class Places:
+    """What the game is played on: N nodes or cells, then the places "arrived" and "failed".
+
+    Attributes:
+        arrived: (N,) bool, where an episode ends as a success.
+        failed: (N,) bool, where it ends without success.
+        running: (N,) bool, where it goes on.
+    """
+
+    arrived: np.ndarray
+    failed: np.ndarray
+    running: np.ndarray
+
+    @property
+    def nodes(self) -> int:
+        """N, the number of nodes or cells."""
+        return len(self.running)
+
+    @property
+    def places(self) -> int:
+        """N + 2."""
+        return self.nodes + 2
+
+
+@dataclass(frozen=True)
+class Lattice(Places):
     """The plant's own transition, tabulated over nodes and input levels.
 
-    Two more places follow the N nodes: number N is "arrived", N + 1 is "failed". A sample that ends between
-    nodes leads to all nodes around its end, and the adversary chooses among them: the lattice errs to the
-    adversary's side, by less than a cell a sample. In three dimensions, or along walls that stop the robot,
-    that would lose every run. There a sample leads to one of these nodes, drawn so that it is right on
-    average, and the game is an estimate. No sample leads to a node inside of such a wall.
+    A sample that ends between nodes leads to all nodes around its end, and the adversary chooses among them:
+    the lattice errs to the adversary's side, by less than a cell a sample. In three dimensions, or along
+    walls that stop the robot, that would lose every run. There a sample leads to one of these nodes, drawn so
+    that it is right on average, and the game is an estimate. No sample leads to a node inside of such a wall.
+
+    Nodes at which an episode that is cut off is a success have arrived, too, if the task has a `verdict` of
+    its own or its episodes never end as a success.
 
     Attributes:
         task: the robot and its problem.
@@ -50,10 +77,6 @@ class Lattice:
             nodes in one sample.
         after: (A, C, N) places around the end of one sample, the nearest first; one of them, C = 1, where
             the game is an estimate.
-        arrived: (N,) bool, nodes at which an episode ends as a success. Also those at which one that is cut
-            off is a success, if the task has a `verdict` of its own or its episodes never end as a success.
-        failed: (N,) bool, nodes at which an episode ends without success.
-        running: (N,) bool, nodes at which an episode goes on.
         hops: (A, d) how far one sample with each level moves the running nodes.
         uneven: (d,) by how much more or less it moves some of them, along each coordinate.
         direct: whether measurement, chart point and position are the same numbers.
@@ -63,22 +86,9 @@ class Lattice:
     grid: Grid
     levels: np.ndarray
     after: np.ndarray
-    arrived: np.ndarray
-    failed: np.ndarray
-    running: np.ndarray
     hops: np.ndarray
     uneven: np.ndarray
     direct: bool
-
-    @property
-    def nodes(self) -> int:
-        """N, the number of nodes."""
-        return len(self.grid.nodes)
-
-    @property
-    def places(self) -> int:
-        """N + 2: the nodes, "arrived" and "failed"."""
-        return self.nodes + 2
 
     @property
     def exact(self) -> bool:
@@ -130,11 +140,6 @@ class Lattice:
         """Raises `BadInput` unless the game can be played on nodes of this task's chart."""
         if why := Lattice.why_not(task, grid):
             raise BadInput(f"{why}: {EPISODES_INSTEAD}")
-
-    @staticmethod
-    def possible(task: Task) -> bool:
-        """Returns whether the game can be played on nodes of this task's chart."""
-        return Lattice.why_not(task) is None
 
     @staticmethod
     def decides(task: Task, grid: Nodes) -> bool:
@@ -191,7 +196,7 @@ class Lattice:
         # Then to be near the set-point is not enough, unless the task says so.
         if not ends_well or type(task).verdict is not Task.verdict:
             arrived |= ~failed & (task.verdict(plant.measurement) == Outcome.REACHED)
-        return Lattice(task, grid, levels, after, arrived, failed, running, hops, uneven, direct)
+        return Lattice(arrived, failed, running, task, grid, levels, after, hops, uneven, direct)
 
     def level_of(self, u: np.ndarray) -> np.ndarray:
         """Returns the levels (n,) int nearest to inputs (n, m).
@@ -224,9 +229,7 @@ class Lattice:
 def nearest_of(grid: Nodes, mask: np.ndarray) -> np.ndarray:
     """Returns the nearest node of a mask (N,) bool to each node: (N,) int."""
     of_mask = np.flatnonzero(mask)
-    return np.asarray(
-        of_mask[grid.chart.tree(grid.nodes[of_mask]).query(grid.chart.in_box(grid.nodes))[1]]
-    )
+    return np.asarray(of_mask[grid.chart.nearest(grid.nodes[of_mask], grid.nodes)[1]])
 
 
 def _ends_well(task: Task) -> bool:

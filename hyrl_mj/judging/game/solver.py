@@ -11,12 +11,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import count
-from typing import Protocol
 
 import numpy as np
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.judging.game.lattice import Lattice
+from hyrl_mj.judging.game.lattice import Lattice, Places
 from hyrl_mj.policies import Controller, is_memory, memory_at_start
 from hyrl_mj.sets import within_reach
 
@@ -126,24 +125,6 @@ def nodes_within(lattice: Lattice, bound: np.ndarray) -> np.ndarray:
     if lattice.estimate:
         return np.where(bound > 0, np.maximum(np.round(cells), 1), 0).astype(int)
     return np.floor(cells + 1e-6).astype(int)
-
-
-class Places(Protocol):
-    """What the game is played on: N nodes or cells, then the places "arrived" and "failed".
-
-    `running`, `arrived` and `failed` (N,) bool are as for `Lattice`.
-    """
-
-    @property
-    def nodes(self) -> int: ...
-    @property
-    def places(self) -> int: ...
-    @property
-    def running(self) -> np.ndarray: ...
-    @property
-    def arrived(self) -> np.ndarray: ...
-    @property
-    def failed(self) -> np.ndarray: ...
 
 
 @dataclass(frozen=True)

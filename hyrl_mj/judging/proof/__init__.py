@@ -2,11 +2,11 @@
 
 `Certificate` proves what is won from every state and under every noise signal within a bound;
 `find_counterexamples` finds signals that really win against the controller. The game decides where cells
-cover the chart (`decides`); `why_no_cells` tells what is in the way.
+cover the chart; `why_no_cells` tells what is in the way.
 """
 
-from hyrl_mj.judging.proof.cells import decides, why_no_cells
+from hyrl_mj.judging.proof.cells import why_no_cells
 from hyrl_mj.judging.proof.certificate import Certificate
-from hyrl_mj.judging.proof.counterexamples import Broken, CellNoise, find_counterexamples
+from hyrl_mj.judging.proof.counterexamples import CellNoise, find_counterexamples
 
-__all__ = ["Broken", "CellNoise", "Certificate", "decides", "find_counterexamples", "why_no_cells"]
+__all__ = ["CellNoise", "Certificate", "find_counterexamples", "why_no_cells"]

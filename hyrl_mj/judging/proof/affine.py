@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -59,7 +60,7 @@ class Affine:
             centre, remainder = (low + high) / 2, (high - low) / 2
         return tidy(Affine(centre, np.zeros((d, *np.shape(centre))), remainder))
 
-    @property
+    @cached_property
     def radius(self) -> np.ndarray:
         """The largest distance (n, ...) from the centre."""
         return np.asarray(np.abs(self.generators).sum(axis=0) + self.remainder)
@@ -91,59 +92,43 @@ class Affine:
         """Returns the form with a larger remainder."""
         return replace(self, remainder=self.remainder + by)
 
-    def each(self, change: Callable[[np.ndarray], np.ndarray]) -> Affine:
-        """Returns the form with all its parts changed by a function that only moves entries."""
-        generators = [change(part) for part in self.generators]
-        parts = (self.centre, self.remainder, self.nan, self.nonnegative)
-        centre, *others = (change(part) for part in parts)
-        return Affine(centre, np.stack(generators), *others)
+
+def rearranged(change: Callable[..., np.ndarray], *forms: Affine) -> Affine:
+    """Returns the form whose parts are those of forms, changed by a function that only moves entries."""
+    generators = [change(*parts) for parts in zip(*(x.generators for x in forms), strict=True)]
+    centre, *others = (
+        change(*(getattr(x, name) for x in forms))
+        for name in ("centre", "remainder", "nan", "nonnegative")
+    )
+    return Affine(centre, np.stack(generators), *others)
 
 
 def tidy(x: Affine) -> Affine:
     """Returns a form in which what is not finite has the remainder infinity."""
-    sums = np.abs(x.centre) + x.radius
-    if np.isfinite(sums).all():
+    wild = ~np.isfinite(np.abs(x.centre) + x.radius)
+    if not wild.any():
         return x
-    wild = ~np.isfinite(sums)
-    return Affine(
-        np.where(wild, 0.0, x.centre),
-        np.where(wild, 0.0, x.generators),
-        np.where(wild, np.inf, x.remainder),
-        x.nan,
-        x.nonnegative,
-    )
-
-
-def lift(x: Affine, ndim: int) -> Affine:
-    """Returns a form with so many dimensions that its generators broadcast like its centre."""
-    if x.centre.ndim == ndim:
-        return x
-    shape = (1,) * (ndim - x.centre.ndim) + x.centre.shape
-    return Affine(
-        x.centre.reshape(shape),
-        x.generators.reshape(len(x.generators), *shape),
-        x.remainder.reshape(shape),
-        x.nan.reshape(shape),
-        x.nonnegative.reshape(shape),
+    return replace(
+        x,
+        centre=np.where(wild, 0.0, x.centre),
+        generators=np.where(wild, 0.0, x.generators),
+        remainder=np.where(wild, np.inf, x.remainder),
     )
 
 
 def pair(a: Affine, b: Affine) -> tuple[Affine, Affine]:
+    """Returns forms with so many dimensions that their generators broadcast like their centres."""
     ndim = max(a.centre.ndim, b.centre.ndim)
-    return lift(a, ndim), lift(b, ndim)
+    a, b = (
+        rearranged(lambda part: part.reshape((1,) * (ndim - part.ndim) + part.shape), x)
+        for x in (a, b)
+    )
+    return a, b
 
 
 def choose(condition: np.ndarray, a: Affine, b: Affine) -> Affine:
     """Returns a where a condition (n, ...) holds, else b."""
-    ndim = max(np.ndim(condition), a.centre.ndim, b.centre.ndim)
-    a, b = lift(a, ndim), lift(b, ndim)
-    return Affine(
-        np.where(condition, a.centre, b.centre),
-        np.where(condition, a.generators, b.generators),
-        np.where(condition, a.remainder, b.remainder),
-        np.where(condition, a.nan, b.nan),
-        np.where(condition, a.nonnegative, b.nonnegative),
-    )
+    return rearranged(lambda x, y: np.asarray(np.where(condition, x, y)), a, b)
 
 
 # ---- arithmetic
@@ -183,11 +168,6 @@ def square(a: Affine) -> Affine:
     r = a.radius
     remainder = 2 * np.abs(a.centre) * a.remainder + r * r / 2
     return Affine(a.centre**2 + r * r / 2, 2 * a.centre * a.generators, remainder, a.nan, True)
-
-
-def one(a: Affine) -> Affine:
-    ones = np.ones_like(a.centre)
-    return Affine(ones, np.zeros_like(a.generators), 0 * ones, False, True)
 
 
 def matmul(a: Affine, b: Affine) -> Affine:

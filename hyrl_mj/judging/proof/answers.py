@@ -13,7 +13,7 @@ from hyrl_mj.judging.proof.assumptions import check_assumptions
 from hyrl_mj.judging.proof.cells import TINY, Cells
 from hyrl_mj.judging.proof.networks import BoundedPolicy
 from hyrl_mj.policies import ON_EDGE, Controller, HybridController, PolicyController
-from hyrl_mj.sets import Everything, Grid, GridSet, StateSet
+from hyrl_mj.sets import Everything, Grid, GridSet, StateSet, within_reach
 from hyrl_mj.tasks import Task
 
 
@@ -127,23 +127,12 @@ class Boxes:
 
     def reachable(self, mask: np.ndarray, bound: np.ndarray) -> np.ndarray:
         """Returns the cells (N,) bool from which noise within bounds (d,) can show a box of a mask (M...)."""
-        periodic = self.cells.lattice.grid.chart.periodic
-        for axis, n in enumerate(self.cells.counts):
-            fine = int(self.fine[axis])
-            reach = int(np.ceil(bound[axis] / self.step[axis] - TINY))
-            if periodic[axis]:
-                reach = min(reach, n * fine // 2 + 1)
-                pads = [(reach, reach) if a == axis else (0, 0) for a in range(mask.ndim)]
-                mask, first = np.pad(mask, pads, mode="wrap"), 0
-            else:
-                first = int(self.pad[axis]) * fine - reach
-            if fine == 1 and not reach:
-                mask = np.take(mask, first + np.arange(n), axis=axis)
-                continue
-            total = np.cumsum(mask, axis=axis, dtype=np.int32)
-            total = np.concatenate([np.zeros_like(np.take(total, [0], axis)), total], axis)
-            begin = first + fine * np.arange(n)
-            mask = np.take(total, begin + fine + 2 * reach, axis) > np.take(total, begin, axis)
+        reach = np.ceil(bound / self.step - TINY).astype(int)
+        mask = within_reach(mask, reach, self.cells.lattice.grid.chart.periodic)
+        for axis, (n, fine) in enumerate(zip(self.cells.counts, self.fine, strict=True)):
+            of_cells = self.pad[axis] * fine + np.arange(n * fine)
+            boxes = np.take(mask, of_cells, axis)
+            mask = np.logical_or.reduceat(boxes, np.arange(0, n * fine, fine), axis)
         return np.asarray(mask.ravel())
 
 
@@ -158,9 +147,7 @@ def _check_task(cells: Cells, task: Task) -> None:
 
 def _all(counts: np.ndarray) -> np.ndarray:
     """Returns all indices (n, d) of an array with `counts` (d,) entries along each axis."""
-    return np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), -1).reshape(
-        -1, len(counts)
-    )
+    return np.indices(tuple(counts)).reshape(len(counts), -1).T
 
 
 def _is_sharp(found: np.ndarray) -> np.ndarray:

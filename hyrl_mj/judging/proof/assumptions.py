@@ -12,7 +12,7 @@ import numpy as np
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.judging.proof.affine import Affine, Unbounded
-from hyrl_mj.judging.proof.networks import bounds_of, program_of
+from hyrl_mj.judging.proof.networks import bounds_of, method_of, program_of
 from hyrl_mj.judging.proof.rules import Truth
 from hyrl_mj.judging.proof.turns import tells_turns
 from hyrl_mj.physics import memory, mjcf
@@ -31,7 +31,8 @@ COMPARED = 1_000
 
 def check_assumptions(task: Task) -> None:
     """Raises `Unbounded` unless all that a proof takes for granted of a task holds."""
-    own = [name for name in DEFAULTS if _is_own(task, name)]
+    methods = {name: getattr(getattr(task, name), "__func__", None) for name in DEFAULTS}
+    own = [name for name, method in methods.items() if method is not getattr(Task, name)]
     model = task.model
     qpos = np.arange(1, model.nq + 1)  # the state begins with the time
     measured = mjcf.state_columns(model)
@@ -53,18 +54,9 @@ def check_assumptions(task: Task) -> None:
     if why := memory.remembers(model) or memory.why_not_direct(model):
         raise Unbounded(f"the plant of {task.name} may not follow its inputs at once: {why}")
     for name in ("observation", "ending", "verdict"):
-        program = program_of(task, getattr(task, name), _method(task, name))
+        program = program_of(task, name)
         _check_turns(task, name, program)
         _check_program(task, name, program)
-
-
-def _is_own(task: Task, name: str) -> bool:
-    method = getattr(getattr(task, name), "__func__", None)
-    return method is not getattr(Task, name)
-
-
-def _method(task: Task, name: str) -> str:
-    return f"the method {name} of {task.name}"
 
 
 def _check_turns(task: Task, name: str, program: Program) -> None:
@@ -74,8 +66,8 @@ def _check_turns(task: Task, name: str, program: Program) -> None:
         turn = chart.sides * (np.arange(chart.dimension) == axis)
         if tells_turns(program, turn):
             raise Unbounded(
-                f"{_method(task, name)} tells whole turns of {chart.names[axis]} apart, or may do so: let it "
-                "use the sine and the cosine, or self.chart.wrap(measured)"
+                f"{method_of(task, name)} tells whole turns of {chart.names[axis]} apart, or may do so: "
+                "let it use the sine and the cosine, or self.chart.wrap(measured)"
             )
 
 
@@ -88,12 +80,12 @@ def _check_program(task: Task, name: str, program: Program) -> None:
     chart, rng = task.chart, np.random.default_rng(1)
     beyond = chart.sides * (0.1 + np.array(chart.periodic))
     z = rng.uniform(chart.low - beyond, chart.high + beyond, (COMPARED, chart.dimension))
-    found = bounds_of(program, _method(task, name), Affine.box(z, np.zeros(chart.dimension)))
+    found = bounds_of(program, method_of(task, name), Affine.box(z, np.zeros(chart.dimension)))
     order, fewer = rng.permutation(COMPARED), (1, 2, 7, 33, 150, 600)
     try:
         parts = [method(z), method(z[order])[np.argsort(order)], *(method(z[:k]) for k in fewer)]
     except BadInput as error:
-        raise Unbounded(f"{_method(task, name)} cannot be followed: {error}") from error
+        raise Unbounded(f"{method_of(task, name)} cannot be followed: {error}") from error
     for given in parts:
         k = len(given)
         if isinstance(found, Truth):
@@ -105,6 +97,6 @@ def _check_program(task: Task, name: str, program: Program) -> None:
         if not same.all():
             row = int(np.argwhere(~same)[0][0])
             raise Unbounded(
-                f"{_method(task, name)} gives another result at {chart.format(z[row])} than the operations "
+                f"{method_of(task, name)} gives another result at {chart.format(z[row])} than the operations "
                 "that it does with the measurement: it may depend on other rows, or on what was before"
             )

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import numpy as np
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.judging.game import Lattice
+from hyrl_mj.judging.game import Lattice, Places
 from hyrl_mj.judging.proof.affine import Affine, Unbounded
 from hyrl_mj.judging.proof.assumptions import check_assumptions
-from hyrl_mj.judging.proof.networks import bounds_of, program_of
+from hyrl_mj.judging.proof.networks import bounds_of, method_of, program_of
 from hyrl_mj.judging.proof.rules import as_form
-from hyrl_mj.sets import Grid, Nodes
+from hyrl_mj.sets import Grid
 from hyrl_mj.tasks import Outcome, Task
 
 # Samples whose ends lie this close to the border of a cell, in cells after a whole episode, end on it.
@@ -31,11 +31,11 @@ FEW = 61
 
 
 @dataclass(frozen=True)
-class Cells:
+class Cells(Places):
     """The closed cells between the nodes of a lattice, a covering of the chart.
 
-    The two places after the N cells are "arrived" and "failed", as for `Lattice`. Every state of a cell,
-    widened by `slack`, is one of the cell's states: rounding in the plant never leaves the covering.
+    Every state of a cell, widened by `slack`, is one of the cell's states: rounding in the plant never leaves
+    the covering. All states of a cell that has arrived, and some of one that has failed, end an episode so.
 
     A run has arrived for good where it ends as a success. Where it does not end, it has to be able to stay
     in cells that would be a success at the end of an episode.
@@ -45,9 +45,7 @@ class Cells:
         counts: (d,) number of cells along each coordinate.
         exact: (d,) bool, whether every sample moves cells onto cells, but for rounding.
         slack: (d,) by how much the cells are widened [chart units].
-        arrived: (N,) bool, cells all of whose states end an episode as a success.
         success: (N,) bool, cells all of whose states are a success if the episode is cut off there.
-        failed: (N,) bool, cells some of whose states may end an episode without success.
         slope, offset: (d, m), (d,) of the displacement in one sample, slope @ u + offset [chart units].
         error: (d,) largest error of the displacement in one sample.
         outside: (M...) int, places of the cells and of those around the chart, from `-margin` on.
@@ -58,29 +56,12 @@ class Cells:
     counts: tuple[int, ...]
     exact: np.ndarray
     slack: np.ndarray
-    arrived: np.ndarray
     success: np.ndarray
-    failed: np.ndarray
     slope: np.ndarray
     offset: np.ndarray
     error: np.ndarray
     outside: np.ndarray
     margin: np.ndarray
-
-    @property
-    def nodes(self) -> int:
-        """N, the number of cells."""
-        return int(np.prod(self.counts))
-
-    @property
-    def places(self) -> int:
-        """N + 2: the cells, "arrived" and "failed"."""
-        return self.nodes + 2
-
-    @cached_property
-    def running(self) -> np.ndarray:
-        """(N,) bool, the cells from which an episode goes on."""
-        return ~(self.arrived | self.failed)
 
     @staticmethod
     def cover(lattice: Lattice, spacing: np.ndarray | None = None) -> Cells:
@@ -135,13 +116,14 @@ class Cells:
         outside = np.where(arrives, n, n + 1)
         outside[inside] = np.arange(n)
         return Cells(
+            arrived=ends[inside],
+            failed=fails[inside],
+            running=~(ends | fails)[inside],
             lattice=lattice,
             counts=tuple(int(k) for k in counts),
             exact=exact,
             slack=slack,
-            arrived=ends[inside],
             success=success[inside],
-            failed=fails[inside],
             slope=slope,
             offset=offset,
             error=error,
@@ -213,6 +195,11 @@ class Cells:
         grid = self.lattice.grid
         return np.asarray(grid.chart.low + grid.spacing * (index + 0.5))
 
+    def draw(self, cells: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Returns a chart point inside of each of cells (n,): (n, d)."""
+        off = rng.uniform(-0.5, 0.5, (len(cells), len(self.counts)))
+        return self.middle(cells) + off * self.lattice.grid.spacing
+
 
 def _displacement(lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
     """Returns slope (d, m) and offset (d,) of the displacement as a function of the input."""
@@ -225,8 +212,7 @@ def _ends(task: Task, boxes: Affine) -> tuple[np.ndarray, np.ndarray, np.ndarray
     """Returns where an episode may fail, surely ends as a success, or is one if cut off: (n,) bool each."""
     found = []
     for name in ("ending", "verdict"):
-        what = f"the method {name} of {task.name}"
-        outcome = bounds_of(program_of(task, getattr(task, name), what), what, boxes)
+        outcome = bounds_of(program_of(task, name), method_of(task, name), boxes)
         found.append(as_form(outcome, len(boxes.generators)))
     ending, verdict = found
     # The outcomes RUNNING, REACHED, and the failures are numbered in this order.
@@ -282,24 +268,15 @@ def _carried(lattice: Lattice) -> np.ndarray:
     return np.asarray(np.abs(hops - np.tile(lattice.hops, (len(before), 1))).max(axis=0))
 
 
-def why_no_cells(task: Task, grid: Grid) -> str | None:
+@lru_cache(8)
+def why_no_cells(task: Task, counts: tuple[int, ...]) -> str | None:
     """Returns why no cells cover this task's chart, so that a game proves nothing and decides nothing.
 
-    None if they do. The cells are tried on few nodes, the plant at the distances of the grid's nodes.
+    None if they do. The cells are tried on few nodes, the plant at the distances of a grid of `counts` nodes.
     """
-    return _why_no_cells(task, tuple(grid.counts))
-
-
-@lru_cache(8)
-def _why_no_cells(task: Task, counts: tuple[int, ...]) -> str | None:
     few = tuple(min(count, FEW) for count in counts)
     try:
         Cells.cover(Lattice.tabulate(task, Grid(task.chart, few)), Grid(task.chart, counts).spacing)
     except (Unbounded, BadInput) as error:
         return str(error)
     return None
-
-
-def decides(task: Task, grid: Nodes) -> bool:
-    """Returns whether the game on these nodes is more than an estimate: cells cover the chart, too."""
-    return Lattice.decides(task, grid) and isinstance(grid, Grid) and not why_no_cells(task, grid)

@@ -42,7 +42,7 @@ class Broken:
 
 
 def find_counterexamples(
-    certificate: Certificate, name: str, controller: Controller, eps: float, seed: int = 0
+    certificate: Certificate, name: str, controller: Controller, eps: float
 ) -> Broken:
     """Attacks a controller where it may lose, and returns where it lost.
 
@@ -57,12 +57,10 @@ def find_counterexamples(
         name: the name of the controller.
         controller: the controller.
         eps: the noise bound.
-        seed: seed of the starts inside of cells.
     """
     game, cells = certificate.game, certificate.cells
-    # With one mode the controller cannot pick another one.
-    modes = np.array([*(controller.modes if len(controller.modes) > 1 else ()), NOT_STARTED])
-    value, rng = game.value(name, eps), np.random.default_rng(seed)
+    modes = np.array(start_modes(controller))
+    value, rng = game.value(name, eps), np.random.default_rng(0)
     region = game.starts & game.winnable(eps)
     attacked, tried = value[-len(modes) :, :-2] >= NEVER, region
     estimate = game.lattice.estimate or cells is None
@@ -95,14 +93,19 @@ def find_counterexamples(
     return Broken(broken[-1], np.asarray(broken.any(axis=0)), all_cells)
 
 
+def start_modes(controller: Controller) -> tuple[int, ...]:
+    """Returns the modes in which a run may start; `NOT_STARTED` if the controller picks it, the last."""
+    # With one mode the controller cannot pick another one.
+    return (*(controller.modes if len(controller.modes) > 1 else ()), NOT_STARTED)
+
+
 def _inside(
     cells: Cells, of_mode: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns up to `MOST_CELLS` of some cells (n,), and a point inside of each: (k,), (k, d)."""
     count = min(len(of_mode), MOST_CELLS)
     at = rng.choice(of_mode, count, replace=False) if count else of_mode
-    off = rng.uniform(-0.5, 0.5, (len(at), len(cells.counts)))
-    return at, cells.middle(at) + off * cells.lattice.grid.spacing
+    return at, cells.draw(at, rng)
 
 
 def _beaten(

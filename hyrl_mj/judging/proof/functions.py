@@ -15,16 +15,11 @@ from hyrl_mj.judging.proof.affine import (
     choose,
     multiply,
     negative,
-    one,
     pair,
     square,
 )
 
 # ---- functions of one quantity
-
-
-def never(a: Affine) -> np.ndarray:
-    return np.zeros(np.shape(a.centre), dtype=bool)
 
 
 def may_be_infinite(a: Affine) -> np.ndarray:
@@ -40,7 +35,7 @@ def smooth(
     slope: Callable[[np.ndarray], np.ndarray],
     curvature: Callable[[np.ndarray, np.ndarray], np.ndarray],
     extremes: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]],
-    nowhere: Callable[[Affine], np.ndarray] = never,
+    nowhere: Callable[[Affine], Any] = lambda a: False,
     nonnegative: bool = False,
 ) -> Callable[[Affine], Affine]:
     """Returns the rule of a smooth function: its tangent in the centre, or its extremes if that tells less.
@@ -130,7 +125,6 @@ def stepwise(value: Callable[[np.ndarray], np.ndarray]) -> Callable[[Affine], Af
 
 
 def maximum(a: Affine, b: Affine) -> Affine:
-    a, b = pair(a, b)
     low, high = np.maximum(a.low, b.low), np.maximum(a.high, b.high)
     either = choose(a.low >= b.high, a, b)
     clear = (a.low >= b.high) | (b.low >= a.high)
@@ -139,7 +133,6 @@ def maximum(a: Affine, b: Affine) -> Affine:
 
 
 def minimum(a: Affine, b: Affine) -> Affine:
-    a, b = pair(a, b)
     found = negative(maximum(negative(a), negative(b)))
     return replace(found, nonnegative=a.positive & b.positive)
 
@@ -194,7 +187,6 @@ def raised(a: Affine, b: Affine) -> Affine:
         return sqrt(a)
     if exponent != round(exponent) or not 1 <= abs(exponent) <= 16:
         raise Unbounded(f"uses np.power with the exponent {exponent:g}")
-    power = reduce(multiply, [square(a)] * int(abs(exponent) // 2), one(a))
-    power = multiply(power, a) if exponent % 2 else power
+    power = reduce(multiply, [square(a)] * int(abs(exponent) // 2) + [a] * int(exponent % 2))
     power = replace(power, nan=a.nan | b.nan)  # a power of a number is one, also of 0 or infinity
     return power if exponent > 0 else _reciprocal(power)

@@ -22,20 +22,22 @@ from hyrl_mj.tracing import BATCH, Program, trace
 
 # Relative rounding error of numbers of 32 bits, in which networks are computed.
 ROUNDING = 2.0**-24
-# A layer's values in boxes: middle (n, k), generators (d, n, k) and remainder (n, k), as `Affine`.
-Relaxed = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
-def program_of(task: Task, function: Callable[[np.ndarray], np.ndarray], name: str) -> Program:
-    """Returns the operations of a method that takes measurements (n, p).
+def method_of(task: Task, name: str) -> str:
+    """Returns what messages call a method of a task."""
+    return f"the method {name} of {task.name}"
+
+
+def program_of(task: Task, name: str) -> Program:
+    """Returns the operations of a method of a task that takes measurements (n, p).
 
     Raises:
         Unbounded: its operations cannot be followed.
     """
-    rng = np.random.default_rng(0)
-    z = task.chart.draw(BATCH, rng)
+    z = task.chart.draw(BATCH, np.random.default_rng(0))
     try:
-        return trace(function, {"measured": z}, name, "bounded")
+        return trace(getattr(task, name), {"measured": z}, method_of(task, name), "bounded")
     except BadInput as error:
         raise Unbounded(str(error)) from error
 
@@ -74,8 +76,7 @@ class BoundedPolicy:
             inner, normalize = policy.policy, policy.preprocessing.normalization
         if type(inner) is not MlpPolicy:  # a class of its own may act otherwise
             raise Unbounded(f"a policy that is a {type(policy).__name__} cannot be bounded")
-        task = inner.task
-        observation = program_of(task, task.observation, _observation_of(task))
+        observation = program_of(inner.task, "observation")
         if normalize is None:
             return BoundedPolicy(inner, observation)
         (result,) = observation.outputs
@@ -96,24 +97,24 @@ class BoundedPolicy:
         return _in_chunks(self._inputs, centre, half)
 
     def _levels(self, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
-        middle, sides, rest = self._hidden(centre, half)
+        x = self._hidden(centre, half)
         weight, bias = self.network.layers[-1]
         k = len(bias)
         first, second = np.divmod(np.arange(k * k), k)
         # How much better the first level is than the second, at least.
         by = (weight[first] - weight[second]).T
-        size = np.abs(middle) + np.abs(sides).sum(axis=0) + rest
+        size = np.abs(x.centre) + np.abs(x.generators).sum(axis=0) + x.remainder
         error = _rounding(len(by)) * (np.abs(weight[first]) + np.abs(weight[second])).T
         offset = bias[first] - bias[second]
-        least = middle @ by + offset - np.abs(sides @ by).sum(axis=0) - rest @ np.abs(by)
+        least = x.centre @ by + offset - np.abs(x.generators @ by).sum(axis=0)
+        least -= x.remainder @ np.abs(by)
         least -= size @ error + _rounding(1) * (np.abs(bias[first]) + np.abs(bias[second]))
         worse = (least > 0).reshape(-1, k, k).any(axis=1)
         return np.asarray(~worse)
 
     def _inputs(self, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
-        middle, sides, rest = _linear(self._hidden(centre, half), *self.network.layers[-1])
-        radius = np.abs(sides).sum(axis=0) + rest
-        ends = np.stack([middle - radius, middle + radius], axis=1).astype(float)
+        x = _linear(self._hidden(centre, half), *self.network.layers[-1])
+        ends = np.stack([x.low, x.high], axis=1).astype(float)
         low, high = self.network.task.input_limits
         unknown = np.isnan(ends).any(axis=1)[:, None]
         ends = np.where(unknown, np.array([[-np.inf], [np.inf]]), ends)
@@ -121,10 +122,10 @@ class BoundedPolicy:
             ends = low + (np.tanh(ends) + 1) / 2 * (high - low)
         return np.clip(ends, low, high)
 
-    def _hidden(self, centre: np.ndarray, half: np.ndarray) -> Relaxed:
-        """Returns the last hidden layer in boxes: its middle, its generators and its remainder."""
-        task = self.network.task
-        seen = bounds_of(self.observation, _observation_of(task), Affine.box(centre, half))
+    def _hidden(self, centre: np.ndarray, half: np.ndarray) -> Affine:
+        """Returns the last hidden layer in boxes, in the single precision of networks."""
+        what = method_of(self.network.task, "observation")
+        seen = bounds_of(self.observation, what, Affine.box(centre, half))
         seen = as_form(seen, centre.shape[1])
         if self.normalization is not None:
             # The network sees the observation in single precision.
@@ -132,23 +133,14 @@ class BoundedPolicy:
             seen = seen.wider(rounding)
             seen = as_form(bounds_of(self.normalization, "VecNormalize", seen), centre.shape[1])
         if seen.wild.any() or seen.nan.any():
-            what = "has no limit" if seen.wild.any() else "may be NaN"
-            raise Unbounded(
-                f"{_observation_of(task)} cannot be bounded: it {what} near some states"
-            )
-        x: Relaxed = (
-            seen.centre.astype(np.float32),
-            seen.generators.astype(np.float32),
-            seen.remainder.astype(np.float32),
-        )
+            why = "has no limit" if seen.wild.any() else "may be NaN"
+            raise Unbounded(f"{what} cannot be bounded: it {why} near some states")
+        parts = seen.centre, seen.generators, seen.remainder
+        x = Affine(*(part.astype(np.float32) for part in parts))
         relax = RELAXATIONS[self.network.activation]
         for weight, bias in self.network.layers[:-1]:
             x = relax(_linear(x, weight, bias))
         return x
-
-
-def _observation_of(task: Task) -> str:
-    return f"the method observation of {task.name}"
 
 
 def _in_chunks(
@@ -165,38 +157,29 @@ def _rounding(terms: int) -> float:
     return 4 * (terms + 2) * ROUNDING
 
 
-def _linear(x: Relaxed, weight: np.ndarray, bias: np.ndarray) -> Relaxed:
+def _linear(x: Affine, weight: np.ndarray, bias: np.ndarray) -> Affine:
     """Returns a linear layer of weight (outputs, inputs); the remainder takes in the rounding errors."""
-    middle, sides, rest = x
-    size = np.abs(middle) + np.abs(sides).sum(axis=0)
+    size = np.abs(x.centre) + np.abs(x.generators).sum(axis=0)
     error = _rounding(weight.shape[1])
-    rest = (rest * (1 + error) + error * size) @ np.abs(weight).T + error * np.abs(bias)
-    return middle @ weight.T + bias, sides @ weight.T, rest
+    rest = (x.remainder * (1 + error) + error * size) @ np.abs(weight).T + error * np.abs(bias)
+    return Affine(x.centre @ weight.T + bias, x.generators @ weight.T, rest)
 
 
-def _parallel(x: Relaxed, slope: np.ndarray, low: np.ndarray, high: np.ndarray) -> Relaxed:
+def _parallel(x: Affine, slope: np.ndarray, low: np.ndarray, high: np.ndarray) -> Affine:
     """Returns an activation that lies between slope * x + low and slope * x + high."""
-    middle, sides, rest = x
     error = 8 * ROUNDING * (1 + np.abs(low) + np.abs(high))
-    return (
-        slope * middle + (low + high) / 2,
-        slope * sides,
-        np.abs(slope) * rest + (high - low) / 2 + error,
+    return Affine(
+        slope * x.centre + (low + high) / 2,
+        slope * x.generators,
+        np.abs(slope) * x.remainder + (high - low) / 2 + error,
     )
 
 
-def _ends(x: Relaxed) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the least and the greatest value."""
-    middle, sides, rest = x
-    radius = np.abs(sides).sum(axis=0) + rest
-    return middle - radius, middle + radius
-
-
-def _kinked(leak: float) -> Callable[[Relaxed], Relaxed]:
+def _kinked(leak: float) -> Callable[[Affine], Affine]:
     """Returns the relaxation of max(x, leak * x): its chord, and the parallel through the kink."""
 
-    def relax(x: Relaxed) -> Relaxed:
-        low, high = _ends(x)
+    def relax(x: Affine) -> Affine:
+        low, high = x.low, x.high
         across = (low < 0) & (high > 0)
         chord = (high - leak * low) / np.where(across, high - low, 1)
         slope = np.where(across, chord, np.where(high > 0, 1, leak)).astype(np.float32)
@@ -205,15 +188,15 @@ def _kinked(leak: float) -> Callable[[Relaxed], Relaxed]:
     return relax
 
 
-def _tanh(x: Relaxed) -> Relaxed:
-    low, high = _ends(x)
+def _tanh(x: Affine) -> Affine:
+    low, high = x.low, x.high
     at_low, at_high = np.tanh(low), np.tanh(high)
     # With the smallest slope between them, the distance from the line is greatest at the ends.
     slope = np.maximum(np.minimum(1 - at_low**2, 1 - at_high**2) - 8 * ROUNDING, 0)
     return _parallel(x, slope, at_low - slope * low, at_high - slope * high)
 
 
-def _curved(name: str, curvature: float) -> Callable[[Relaxed], Relaxed]:
+def _curved(name: str, curvature: float) -> Callable[[Affine], Affine]:
     """Returns the relaxation of an activation by its chord, from its values at points between the ends.
 
     Between neighbouring points it leaves their chord by the largest second derivative times their squared
@@ -221,8 +204,8 @@ def _curved(name: str, curvature: float) -> Callable[[Relaxed], Relaxed]:
     """
     activate = ACTIVATIONS[name]
 
-    def relax(x: Relaxed) -> Relaxed:
-        low, high = _ends(x)
+    def relax(x: Affine) -> Affine:
+        low, high = x.low, x.high
         width = high - low
         rise = activate(high) - activate(low)
         slope = np.where(width > 0, rise / np.where(width > 0, width, 1), 0)
@@ -237,7 +220,7 @@ def _curved(name: str, curvature: float) -> Callable[[Relaxed], Relaxed]:
 
 
 # By activation; the numbers are the largest magnitudes of their second derivatives.
-RELAXATIONS: dict[str, Callable[[Relaxed], Relaxed]] = {
+RELAXATIONS: dict[str, Callable[[Affine], Affine]] = {
     "relu": _kinked(0.0),
     "leaky_relu": _kinked(0.01),
     "tanh": _tanh,

@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
-from hyrl_mj.judging.game import (
-    NEARLY,
-    NEVER,
-    LostReplay,
-    ReplayCount,
-    Score,
-)
+from hyrl_mj.judging.game import NEARLY, NEVER, LostReplay, ReplayCount, Score
 from hyrl_mj.judging.proof.cells import Cells
 from hyrl_mj.judging.proof.certificate import Certificate
-from hyrl_mj.judging.proof.counterexamples import CellNoise
+from hyrl_mj.judging.proof.counterexamples import CellNoise, start_modes
 from hyrl_mj.policies import Controller
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import (
@@ -25,10 +18,12 @@ from hyrl_mj.simulation import (
     AnyNoise,
     LoopSettings,
     Noise,
+    Rollout,
     closed_loop,
     covers_sensor,
     judge,
 )
+from hyrl_mj.system.progress import progress_bar
 from hyrl_mj.tasks import Outcome, Task
 
 # Starts by kind of noise, 10,000 in all: a run of a minute takes about two seconds longer. The noise between
@@ -72,84 +67,80 @@ class Batch:
     steps: np.ndarray | None = None
 
 
-@dataclass(frozen=True)
-class Played:
-    """What a batch came to: the number of runs, those lost (n,) bool, and judged, and the first lost one."""
+def replay(
+    certificate: Certificate, name: str, controller: Controller, score: Score
+) -> ReplayCount | None:
+    """Plays in MuJoCo what a score says before it is believed, and returns what was lost.
 
-    kind: str
-    lost: np.ndarray
-    judged: int
-    first: LostReplay | None
+    Where something is proved these are starts anywhere in proved cells, for each start mode and for the mode
+    that the controller picks. Where nothing is proved of nearly all winnable starts, but no signal is known
+    that beats one of them, they lie in winnable cells, and the controller picks its mode. With the weakest
+    first: a third lies at the border of what is proved, a third where it arrives latest, and the others are
+    starts of the score, at random.
 
-
-@dataclass(frozen=True)
-class Replays:
-    """The replays of what is said of one controller.
-
-    Attributes:
-        name: the name of the controller.
-        eps, everywhere: of the noise.
-        of: what is said of the starts, "proved" or "won".
-        batches: the starts with their noise.
+    Returns:
+        The count, None if the score says nothing, or is an estimate.
     """
-
-    name: str
-    eps: float
-    everywhere: bool
-    of: str
-    batches: tuple[Batch, ...]
-
-    @staticmethod
-    def of_score(
-        certificate: Certificate, name: str, controller: Controller, score: Score, seed: int = 0
-    ) -> Replays | None:
-        """Returns the replays that a score needs before it is believed, None if it says nothing.
-
-        Where something is proved these are starts anywhere in proved cells, for each start mode and for the
-        mode that the controller picks. Where nothing is proved of nearly all winnable starts, but no signal
-        is known that beats one of them, they lie in winnable cells, and the controller picks its mode. With
-        the weakest first: a third lies at the border of what is proved, a third where it arrives latest, and
-        the others are starts of the score, at random.
-
-        Of each kind of noise the first `WHOLE` episodes are played to their end. The others are until they
-        are proved to have arrived for good, and a batch to its end only if one has not.
-        """
-        if certificate.game.lattice.estimate or not score.winnable:
-            return None
-        nearly = score.proved is not None and score.proved >= NEARLY
-        whole = score.not_broken == 1
-        if not (nearly or whole or score.proved):
-            return None
-        of = "won" if whole and not nearly else "proved"
-        # A tenth of the starts is played where so little is proved that no word follows from it.
-        rng, few = np.random.default_rng(seed), 1 if nearly or whole else 10
-        pools = _pools(certificate, name, controller, score.eps, of)
-        batches = []
-        for kind, noise in _noises(certificate, name, controller, score.eps).items():
-            z0, q0, samples = _drawn(pools, STARTS[kind] // few, rng)
-            for first in (0, *range(WHOLE, len(z0), BATCH)):
-                part = slice(first, first + BATCH if first else WHOLE)
-                number = int(rng.integers(2**31))
-                steps = samples[part] if first else None
-                batches.append(Batch(controller, noise, kind, z0[part], q0[part], number, steps))
-        return Replays(name, score.eps, certificate.game.everywhere, of, tuple(batches))
-
-    def count(self, results: Iterable[Played]) -> ReplayCount:
-        """Returns what the batches came to, in their order."""
-        starts: dict[str, int] = {}
-        lost: dict[str, int] = {}
-        judged, first = 0, None
-        for result in results:
-            starts[result.kind] = starts.get(result.kind, 0) + len(result.lost)
-            lost[result.kind] = lost.get(result.kind, 0) + int(result.lost.sum())
-            judged, first = judged + result.judged, first or result.first
-        return ReplayCount(
-            self.name, self.eps, self.everywhere, self.of, starts, lost, judged, first
-        )
+    game = certificate.game
+    if game.lattice.estimate or not score.winnable:
+        return None
+    nearly = score.proved is not None and score.proved >= NEARLY
+    whole = score.not_broken == 1
+    if not (nearly or whole or score.proved):
+        return None
+    of = "won" if whole and not nearly else "proved"
+    # A tenth of the starts is played where so little is proved that no word follows from it.
+    few = 1 if nearly or whole else 10
+    batches = batches_of(certificate, name, controller, score.eps, of, few)
+    starts, lost = ({batch.kind: 0 for batch in batches} for _ in range(2))
+    judged, first = 0, None
+    # One after the other: the physics takes all cores, and the rest holds the interpreter's lock.
+    for batch in progress_bar(batches, "replays", "games"):
+        run, again = play(game.task, batch)
+        losing = np.flatnonzero(run.outcome != Outcome.REACHED)
+        starts[batch.kind] += len(run.outcome)
+        lost[batch.kind] += len(losing)
+        judged += again
+        if first is None and len(losing):
+            at = losing[0]
+            mode = None if batch.q0[at] == NOT_STARTED else int(batch.q0[at])
+            outcome = Outcome(run.outcome[at]).label
+            first = LostReplay(tuple(map(float, batch.z0[at])), mode, batch.kind, outcome)
+    return ReplayCount(name, score.eps, game.everywhere, of, starts, lost, judged, first)
 
 
-def play(task: Task, batch: Batch) -> Played:
+def batches_of(
+    certificate: Certificate,
+    name: str,
+    controller: Controller,
+    eps: float,
+    of: str,
+    few: int = 1,
+) -> list[Batch]:
+    """Returns one in `few` of the `STARTS` of which something is said, with their noise.
+
+    Of each kind of noise the first `WHOLE` episodes are played to their end. The others are until they are
+    proved to have arrived for good.
+    """
+    rng, pools = np.random.default_rng(0), _pools(certificate, name, controller, eps, of)
+    batches = []
+    for kind, noise in _noises(certificate, name, controller, eps).items():
+        z0, q0, samples = _drawn(pools, STARTS[kind] // few, rng)
+        for first in (0, *range(WHOLE, len(z0), BATCH)):
+            part = slice(first, first + BATCH if first else WHOLE)
+            number = int(rng.integers(2**31))
+            steps = samples[part] if first else None
+            batches.append(Batch(controller, noise, kind, z0[part], q0[part], number, steps))
+    return batches
+
+
+def play(task: Task, batch: Batch) -> tuple[Rollout, int]:
     """Plays a batch on the plant, and every twentieth run and all lost ones once more in plain MuJoCo.
+
+    A batch is played to its end only if one of its runs has not arrived when that is proved.
+
+    Returns:
+        The runs, and the number of those that plain MuJoCo played.
 
     Raises:
         BadInput: the plant did not do what plain MuJoCo does.
@@ -160,19 +151,12 @@ def play(task: Task, batch: Batch) -> Played:
         run = closed_loop(
             task, batch.controller, batch.z0, batch.noise, batch.q0, batch.seed, settings
         )
-        lost = run.outcome != Outcome.REACHED
-        if steps is None or not lost.any():
+        judged = run.outcome != Outcome.REACHED
+        if steps is None or not judged.any():
             break
-    judged = lost.copy()
     judged[::20] = True
     judge(task, run, task.state(batch.z0), np.flatnonzero(judged))
-    first = None
-    if lost.any():
-        at = int(lost.argmax())
-        mode = None if batch.q0[at] == NOT_STARTED else int(batch.q0[at])
-        outcome = Outcome(run.outcome[at]).label
-        first = LostReplay(tuple(map(float, batch.z0[at])), mode, batch.kind, outcome)
-    return Played(batch.kind, lost, int(judged.sum()), first)
+    return run, int(judged.sum())
 
 
 def _noises(
@@ -219,10 +203,8 @@ class _Pool:
         rest = rng.choice(self.counted, n - sum(map(len, weak)))
         places, q0 = np.concatenate([*weak, rest]), np.full(n, self.q0)
         samples = self.samples[places]
-        if self.cells is None:
-            return self.grid.nodes[places], q0, samples
-        off = rng.uniform(-0.5, 0.5, (n, len(self.grid.counts)))
-        return self.cells.middle(places) + off * self.grid.spacing, q0, samples
+        z0 = self.cells.draw(places, rng) if self.cells else self.grid.nodes[places]
+        return z0, q0, samples
 
 
 def _pools(
@@ -233,8 +215,7 @@ def _pools(
     if not region.any():  # a start region thinner than a cell
         cells, region = None, game.starts & game.winnable(eps)
     grid, rng, pools = game.lattice.grid, np.random.default_rng(0), []
-    # With one mode the controller cannot pick another one.
-    modes = [*(controller.modes if len(controller.modes) > 1 else ()), NOT_STARTED]
+    modes = start_modes(controller)
     proved = of == "proved" and cells is not None
     values = (certificate if proved else game).value(name, eps)[:, :-2]
     if cells is not None and not proved:

@@ -129,12 +129,7 @@ def _rounding(operation: Operation, found: Affine, operands: list[Any]) -> np.nd
     size = np.abs(found.centre) + found.radius
     # The errors of sums go with their operands, not with their result.
     if operation.name in ("add", "subtract", "sum", "matmul"):
-        sizes = [
-            Affine(
-                np.abs(o.centre) + o.radius, np.zeros_like(o.generators), np.zeros_like(o.centre)
-            )
-            for o in operands
-        ]
+        sizes = [as_form(np.abs(o.centre) + o.radius, len(o.generators)) for o in operands]
         terms = max(2, *(int(np.prod(o.centre.shape[1:], dtype=int)) for o in operands))
         whole = RULES["add" if operation.name == "subtract" else operation.name]
         size = terms * whole(*sizes, **operation.options).centre
@@ -173,17 +168,14 @@ def _truth(x: Any) -> Truth:
 
 
 def _greater(a: Affine, b: Affine) -> Truth:
-    a, b = affine.pair(a, b)
     return Truth((a.low > b.high) & ~(a.nan | b.nan), a.high > b.low)
 
 
 def _greater_equal(a: Affine, b: Affine) -> Truth:
-    a, b = affine.pair(a, b)
     return Truth((a.low >= b.high) & ~(a.nan | b.nan), a.high >= b.low)
 
 
 def _equal(a: Affine, b: Affine) -> Truth:
-    a, b = affine.pair(a, b)
     point = (a.radius == 0) & (b.radius == 0) & ~(a.nan | b.nan)
     return Truth(point & (a.centre == b.centre), (a.low <= b.high) & (b.low <= a.high))
 
@@ -198,7 +190,7 @@ def _where(condition: Any, a: Any, b: Any) -> Affine | Truth:
         )
         return Truth(surely, possibly)
     d = len((a if isinstance(a, Affine) else b).generators)
-    a, b = affine.pair(as_form(a, d), as_form(b, d))
+    a, b = as_form(a, d), as_form(b, d)
     hull = replace(
         Affine.between(np.minimum(a.low, b.low), np.maximum(a.high, b.high), d),
         nan=a.nan | b.nan,
@@ -222,20 +214,14 @@ def _astype(a: Any, dtype: str) -> Any:
 
 
 def _concatenate(*parts: Affine, axis: int) -> Affine:
-    return Affine(
-        np.concatenate([part.centre for part in parts], axis),
-        np.concatenate([part.generators for part in parts], axis + 1),
-        np.concatenate([part.remainder for part in parts], axis),
-        np.concatenate([part.nan for part in parts], axis),
-        np.concatenate([part.nonnegative for part in parts], axis),
-    )
+    return affine.rearranged(lambda *arrays: np.concatenate(arrays, axis), *parts)
 
 
 def _take(a: Affine, indices: Affine, axis: int) -> Affine:
     if indices.radius.any() or indices.nan.any():
         raise Unbounded("looks up values by an index that depends on the state")
     at = indices.centre.astype(int)
-    return a.each(lambda x: np.take(x, at, axis))
+    return affine.rearranged(lambda x: np.take(x, at, axis), a)
 
 
 def _reduced(name: str) -> Callable[..., Affine]:
@@ -323,10 +309,12 @@ RULES: dict[str, Callable[..., Any]] = {
     "where": _where,
     "astype": _astype,
     "concatenate": _concatenate,
-    "reshape": lambda a, shape: a.each(lambda x: x.reshape(shape)),
-    "transpose": lambda a, axes: a.each(lambda x: x.transpose(axes)),
+    "reshape": lambda a, shape: affine.rearranged(lambda x: x.reshape(shape), a),
+    "transpose": lambda a, axes: affine.rearranged(lambda x: x.transpose(axes), a),
     "take": _take,
-    "full": lambda a, shape, dtype: _astype(a.each(lambda x: np.broadcast_to(x, shape)), dtype),
+    "full": lambda a, shape, dtype: _astype(
+        affine.rearranged(lambda x: np.broadcast_to(x, shape), a), dtype
+    ),
 }
 
 
