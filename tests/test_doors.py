@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import time
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from random import Random
@@ -72,8 +73,9 @@ def inspected(monkeypatch):
 
     def as_of(task):
         def inspect(description, untried):
-            spec = replace(task.specification, description=description, max_steps=description.steps)
-            return spec, task._pool, task._instance
+            spec, pool = task.specification, copy(task._pool)
+            pool.spec = replace(spec, description=description, max_steps=description.steps)
+            return pool, task._instance
 
         monkeypatch.setattr(making, "inspect", inspect)
         monkeypatch.setattr(making, "_MADE", {})

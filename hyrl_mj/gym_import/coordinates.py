@@ -76,7 +76,7 @@ def _resolved(instance: Instance, new: str, name: str) -> Iterator[Coordinate]:
         if index is not None and index >= len(columns):
             raise unknown("coordinate", name, [f"{base}[{i}]" for i in range(len(columns))])
         chosen = columns if index is None else [columns[index]]
-        yield from _fitted(instance, new, name, lambda state: instance.rested(state)[chosen])
+        yield from _fitted(instance, new, name, lambda state: instance.put(state)[chosen])
     elif base in _named(model, SITE, BODY):
         where, i = mjcf.point_of(model, base)
         axes = [0, 1] if index is None else [index]
@@ -174,59 +174,40 @@ def walls(model: mujoco.MjModel) -> np.ndarray:
     return np.flatnonzero(~moves & ~is_plane & (collides | named))
 
 
-def groups_of(instance: Instance, places: np.ndarray) -> tuple[list[list[int]], list[list[int]]]:
-    """Returns the groups of walls that touch each other: those around all places, and those beside them.
-
-    Args:
-        instance: the environment.
-        places: (n, 2) where the robot has been; a group is around them if a box around it is.
-    """
-    model, data = instance.model, instance.data
-    around: list[list[int]] = []
-    beside: list[list[int]] = []
-    for geoms in touching(model, data, walls(model).tolist()):
-        centres = data.geom_xpos[geoms][:, :2]
-        size = model.geom_rbound[geoms][:, None]
-        low, high = (centres - size).min(axis=0), (centres + size).max(axis=0)
-        (around if ((low < places) & (places < high)).all() else beside).append(geoms)
-    return around, beside
-
-
-def islands_of(instance: Instance, beside: Sequence[list[int]]) -> dict[str, int]:
-    """Returns the groups of walls that can be passed on both sides, by name, each with the id of one geom."""
-    found: dict[str, int] = {}
-    for geoms in beside:
-        centres = instance.data.geom_xpos[geoms][:, :2]
-        middle = np.linalg.norm(centres - centres.mean(axis=0), axis=1).argmin()
-        found[f"island {len(found) + 1}"] = geoms[int(middle)]
-    return found
-
-
 def bounds_of(
-    instance: Instance,
-    chart: Sequence[Coordinate],
-    samples: np.ndarray,
-    given: Mapping[str, tuple[float, float]],
-    around: Sequence[list[int]],
-    beside: Sequence[list[int]],
-) -> list[Bound]:
-    """Returns the ends of the chart's coordinates.
+    instance: Instance, met: np.ndarray, begun: np.ndarray
+) -> tuple[list[Bound], dict[str, int]]:
+    """Returns the ends of the chart's coordinates, and what can be passed on both sides: `islands` of a spec.
+
+    Walls that touch each other are one. Those around all sampled runs are the end of the chart in the plane;
+    the others can be passed, and there is room for that.
 
     Args:
         instance: the environment.
-        chart: its coordinates.
-        samples: (n, d) chart points that sampled runs have met.
-        given: ends that the user has given, by name.
-        around, beside: groups of walls. Those around all runs are the end of the chart; the others can be
-            passed, and there is room for that.
+        met: (n, d) chart points that sampled runs have met.
+        begun: (n, d) chart points that resets have led to.
     """
-    model, found = instance.model, []
-    ids, others = ([g for geoms in groups for g in geoms] for groups in (around, beside))
-    solid = np.flatnonzero(robot_of(model, chart)[model.geom_bodyid])
-    passing = 2 * float(model.geom_rbound[solid].max(initial=0.0))
-    for i, c in enumerate(chart):
-        if c.name in given:
-            low, high = given[c.name]
+    spec, model, data = instance.spec, instance.model, instance.data
+    ids, others, islands = list[int](), list[int](), dict[str, int]()
+    if len(spec.coordinates) >= 2 and all(c.unit == "m" for c in spec.coordinates[:2]):
+        places = (met - spec.offset)[:, :2]
+        for geoms in touching(model, data, walls(model).tolist()):
+            centres, size = data.geom_xpos[geoms][:, :2], model.geom_rbound[geoms][:, None]
+            low, high = (centres - size).min(axis=0), (centres + size).max(axis=0)
+            if ((low < places) & (places < high)).all():
+                ids += geoms
+            else:
+                others += geoms
+                middle = np.linalg.norm(centres - centres.mean(axis=0), axis=1).argmin()
+                islands[f"island {len(islands) + 1}"] = geoms[int(middle)]
+    samples, passing = (
+        np.vstack([met, begun]),
+        2 * float(model.geom_rbound[spec.solid].max(initial=0.0)),
+    )
+    found = []
+    for i, c in enumerate(spec.coordinates):
+        if c.name in spec.description.bounds:
+            low, high = spec.description.bounds[c.name]
             found.append(Bound(float(low), float(high), False, "given"))
         elif c.kind == "qpos" and model.jnt_limited[c.joint]:
             low, high = model.jnt_range[c.joint] + c.offset
@@ -243,7 +224,7 @@ def bounds_of(
                 ends = _extent(instance, others, c, passing)
                 low, high, why = min(low, ends[0]), max(high, ends[1]), "sampled runs and walls"
             found.append(Bound(low, high, False, why))
-    return found
+    return found, islands
 
 
 def _extent(

@@ -56,14 +56,14 @@ class Expression:
     Attributes:
         text: the expression, as the user gives it.
         what: what it decides, as messages call it.
-        keys: the entries of `info` that it needs, as paths: `info["a"][0]` is ("a", 0).
-        places: the pairs of names in the model whose distance it needs.
+        asked: the names that it needs, each once: "terminated", "truncated", "reward"; ("info", path) of an
+            entry of `info`, where `info["a"][0]` has the path ("a", 0); ("distance", a, b) of a pair of names
+            in the model.
     """
 
     text: str
     what: str = "success"
-    keys: tuple[Path, ...] = ()
-    places: tuple[tuple[str, str], ...] = ()
+    asked: tuple[Any, ...] = ()
     _tree: Any = field(default=None, repr=False, compare=False)
 
     @classmethod
@@ -83,16 +83,14 @@ class Expression:
         unread.holds(asked)
         if not asked:
             unread._refuse(f"it asks nothing of the environment: use {FORMS}")
-        keys = tuple(name[1] for name in asked if name[0] == "info")
-        places = tuple(name[1:] for name in asked if name[0] == "distance")
-        return cls(text, what, keys, places, tree)
+        return cls(text, what, tuple(asked), tree)
 
     def holds(self, values: Mapping[Any, np.ndarray]) -> np.ndarray:
         """Returns where the expression holds, (k,) bool.
 
         Args:
-            values: what k copies report, arrays (k,): "terminated", "truncated", "reward"; for each of `keys`
-                ("info", path), NaN where missing; for each of `places` ("distance", a, b), in metres.
+            values: what k copies report, arrays (k,), by the names of `asked`: entries of `info` NaN where
+                missing, and distances in metres.
 
         Raises:
             BadInput: an entry of `info` that has to be true or false is another number.
@@ -113,12 +111,10 @@ class Expression:
         return self._tree is not None and holds(self._tree)
 
     def _refuse(self, why: str) -> NoReturn:
-        raise BadInput(f"{self.what} {_short(str(self.text))!r} cannot be used: {why}")
+        raise BadInput(f"{self.what} {_short(self.text)!r} cannot be used: {why}")
 
     def _parsed(self) -> ast.expr:
         """Returns the syntax tree of the text."""
-        if not isinstance(self.text, str):
-            self._refuse("give text, such as 'reward >= 1'")
         source = self.text.strip()
         if not source:
             self._refuse(f"it is empty: use {FORMS}")

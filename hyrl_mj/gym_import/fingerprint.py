@@ -24,7 +24,7 @@ import numpy as np
 from gymnasium import spaces
 
 from hyrl_mj.gym_import.opening import layers
-from hyrl_mj.gym_import.physics import STATE
+from hyrl_mj.gym_import.physics import Physics
 
 # Objects of these modules hold no memory of an environment, or it is in MuJoCo's state.
 PASSED = (
@@ -176,7 +176,8 @@ def _walk(value: Any, path: str, found: Fingerprint, seen: set[int], depth: int)
         return
     elif isinstance(value, mujoco.MjData | mujoco.MjModel):  # another one than that of its state
         seen.add(id(value))
-        found[path] = _of_data(value) if isinstance(value, mujoco.MjData) else of_model(value)
+        is_model = isinstance(value, mujoco.MjModel)
+        found[path] = of_model(value) if is_model else Physics(value.model, value).read().tobytes()
     elif has_no_memory(value):
         return
     elif depth > DEEPEST or len(found) > MOST:
@@ -213,20 +214,18 @@ def _parts(value: Any, path: str, found: Fingerprint, depth: int) -> dict[str, A
     if type(value).__module__.partition(".")[0] == "torch" and hasattr(value, "detach"):
         return {path: value.detach().cpu().numpy()}
     if not hasattr(value, "__dict__"):
-        found[path] = _written(value)
+        try:
+            found[path] = pickle.dumps(value)
+        except Exception:  # whatever a foreign class raises
+            found[path] = Unknown(id(value))
         return {}
-    slots = {name: getattr(value, name) for name in _slots(value.__class__) if hasattr(value, name)}
+    state = object.__getstate__(value)  # with what a class keeps outside of `__dict__`, if it does
+    slots = state[1] if isinstance(state, tuple) else {}
     # Arguments of a constructor, and methods that are put in by `Chain`.
     passed = "_ezpickle_args", "_ezpickle_kwargs", "_saved_kwargs", "step", "reset"
     left_out = passed if depth == 0 else ()
     own = {name: part for name, part in vars(value).items() if name not in left_out}
     return {f"{path}.{name}" if path else name: part for name, part in {**own, **slots}.items()}
-
-
-def _of_data(data: mujoco.MjData) -> bytes:
-    state = np.empty(mujoco.mj_stateSize(data.model, STATE))
-    mujoco.mj_getState(data.model, data, state, STATE)
-    return state.tobytes()
 
 
 def _variables_of(function: Any) -> dict[str, Any]:
@@ -239,24 +238,6 @@ def _variables_of(function: Any) -> dict[str, Any]:
         with suppress(ValueError):  # the cell is empty
             found[name] = cell.cell_contents
     return found
-
-
-@cache
-def _slots(kind: Any) -> list[str]:
-    """Returns the names of attributes that a class keeps outside of `__dict__`."""
-    names: list[str] = []
-    for base in kind.__mro__:
-        slots = vars(base).get("__slots__", ())
-        names += [slots] if isinstance(slots, str) else list(slots)
-    return [name for name in names if name not in ("__dict__", "__weakref__")]
-
-
-def _written(value: Any) -> Any:
-    """Returns a value of some other type as bytes, as far as it can be written down."""
-    try:
-        return pickle.dumps(value)
-    except Exception:  # whatever a foreign class raises
-        return Unknown(id(value))
 
 
 def has_no_memory(value: Any) -> bool:

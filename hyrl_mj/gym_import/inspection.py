@@ -17,24 +17,17 @@ from hyrl_mj.gym_import.coordinates import (
     all_names,
     bounds_of,
     coordinates,
-    groups_of,
-    islands_of,
     robot_of,
 )
 from hyrl_mj.gym_import.draws import check_draws, states_of_resets
 from hyrl_mj.gym_import.expressions import Expression
 from hyrl_mj.gym_import.fingerprint import codes_of, differing, is_known
-from hyrl_mj.gym_import.fresh import Fresh
 from hyrl_mj.gym_import.instance import Instance
 from hyrl_mj.gym_import.observations import parts_of
 from hyrl_mj.gym_import.opening import FORMS, AnyChart, Description, layers
 from hyrl_mj.gym_import.pool import Pool
-from hyrl_mj.gym_import.specification import (
-    Criterion,
-    EnvironmentSpec,
-)
-from hyrl_mj.gym_import.uses import check_noted, check_use
-from hyrl_mj.gym_import.wrappers import changes_by_reset, check_told, senses
+from hyrl_mj.gym_import.specification import Criterion
+from hyrl_mj.gym_import.uses import changes_by_reset, check_noted, check_told, check_use, senses
 from hyrl_mj.physics import mjcf
 from hyrl_mj.sets import Chart
 
@@ -45,10 +38,8 @@ LAG = {
 }
 
 
-def inspect(
-    description: Description, untried: bool = False
-) -> tuple[EnvironmentSpec, Pool, Instance]:
-    """Returns what is known of an environment, what plays its episodes, and an instance to look at.
+def inspect(description: Description, untried: bool = False) -> tuple[Pool, Instance]:
+    """Returns what plays the episodes of an environment and knows about it, and an instance to look at.
 
     Args:
         description: what the user says of it.
@@ -57,15 +48,15 @@ def inspect(
     Raises:
         BadInput: it cannot be used, or one of its instances went another way than a new one.
     """
-    fresh, spec = Fresh(description), EnvironmentSpec(description)  # before anything has been made
-    if untried and fresh.available:
-        fresh.try_out(spec)
+    pool = Pool(description)  # before anything has been made
+    if untried and pool.forks:
+        pool.try_out()
     elif untried and trust.is_received():
         raise BadInput(
-            f"{spec.name} comes from a file of others, and this process cannot fork another one that tries "
-            "it within limits of time and memory: open it once in the main process of a program"
+            f"{description.name} comes from a file of others, and this process cannot fork another one that "
+            "tries it within limits of time and memory: open it once in the main process of a program"
         )
-    instance = Instance(spec)
+    instance = Instance(pool.spec)
     _check_times(instance)
     instance.reset()
     _learn_spaces(instance)
@@ -79,40 +70,36 @@ def inspect(
     instance = Instance(instance.spec)  # something may have outlasted the resets of the other
     instance.learn(state=_at_rest(instance))
     _learn_bounds(instance, instance.spec.z(states), instance.spec.z(begun))
-    step = trials.MOVED * instance.spec.chart.sides * (np.array(instance.spec.noisy) > 0)
-    trials.check_observer(instance, step)
+    trials.check_observer(instance)
     check_use(instance.spec)
     check_noted(instance.spec)
-    derived, late = trials.derived_of(instance, step)
+    derived, late = trials.derived_of(instance)
     if late:
         instance.spec.found["lag"] = f"observation {', '.join(map(str, late))} {LAG[derived]}"
     instance.learn(derived=derived)
     if instance.is_wrapped:
         instance.learn(anew=changes_by_reset(instance.spec))
-        check_told(instance.spec, step)
-        instance.learn(sensing=senses(instance.spec, step))
-    pool = Pool(instance.spec, fresh)
-    moves, affine = trials.moving(pool, instance.spec)
-    instance.learn(moves=moves, affine=affine)
-    trials.check_instances(pool, instance.spec)
-    remembers = not instance.spec.memoryless or not trials.goes_on(pool, instance.spec)
-    spec = replace(instance.spec, memoryless=not remembers)
-    instance = Instance(spec)
+        check_told(instance.spec)
+        instance.learn(sensing=senses(instance.spec))
+    pool.spec = instance.spec
+    moves, affine = trials.moving(pool)
+    trials.check_instances(pool)
+    memoryless = pool.spec.memoryless and trials.goes_on(pool)
+    pool.spec = replace(pool.spec, moves=moves, affine=affine, memoryless=memoryless)
+    instance = Instance(pool.spec)
     instance.reset()
-    return spec, pool, instance
+    return pool, instance
 
 
 def _check_times(instance: Instance) -> None:
     """Raises `BadInput` if a reset or a step takes so long that runs would take hours."""
-    for name, most, why in (
-        ("reset", 3.0, "each of thousands of episodes begins with it"),
-        ("step", 0.3, "thousands of episodes take many of them"),
+    u = instance.drawn(np.random.default_rng(0))
+    for name, most, why, take in (
+        ("reset", 3.0, "each of thousands of episodes begins with it", instance.reset),
+        ("step", 0.3, "thousands of episodes take many of them", lambda: instance.stepped(u)),
     ):
         began = time.monotonic()
-        if name == "reset":
-            instance.reset()
-        else:
-            instance.stepped(instance.drawn(np.random.default_rng(0)))
+        take()
         if (took := time.monotonic() - began) > most:
             raise BadInput(
                 f"{name}() of {instance.name} takes {took:.1f} s, and {why}: give an environment whose "
@@ -307,10 +294,7 @@ def _learn_bounds(instance: Instance, met: np.ndarray, begun: np.ndarray) -> Non
     for name in given.bounds:
         if name not in names:
             raise BadInput(f"bounds for {name} cannot be used: the chart has {', '.join(names)}")
-    in_plane = len(names) >= 2 and all(c.unit == "m" for c in spec.coordinates[:2])
-    around, beside = groups_of(instance, (met - spec.offset)[:, :2]) if in_plane else ([], [])
-    samples = np.vstack([met, begun])
-    bounds = bounds_of(instance, spec.coordinates, samples, given.bounds, around, beside)
+    bounds, islands = bounds_of(instance, met, begun)
     found["bounds"] = ", ".join(
         f"{name} {b.low:.3g} to {b.high:.3g} (from {b.why})"
         for name, b in zip(names, bounds, strict=True)
@@ -331,7 +315,7 @@ def _learn_bounds(instance: Instance, met: np.ndarray, begun: np.ndarray) -> Non
         found["steps"] = f"{max_steps} ({max_steps * spec.dt:g} s) of an episode"
     instance.learn(
         chart=Chart(names, tuple(c.unit for c in spec.coordinates), low, high, periodic),
-        islands=islands_of(instance, beside),
+        islands=islands,
         start_low=start_low,
         start_high=start_high,
         max_steps=max_steps,

@@ -1,8 +1,8 @@
 """One instance of an environment, which plays an episode from its start to its end.
 
 A sample has two phases. `act` steps the environment; then `sense` gives what it observes under the noise of
-that sample. Where wrappers lie around the environment, its own `step` waits inside of theirs between the two,
-so that stacks, delays, filters and normalisation see what a sensor would have sent.
+that sample. Where wrappers lie around the environment, its own `step` pauses inside of theirs between the
+two, so that stacks, delays, filters and normalisation see what a sensor would have sent.
 """
 
 from __future__ import annotations
@@ -10,23 +10,31 @@ from __future__ import annotations
 import copy
 import math
 import random
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 
 from hyrl_mj.errors import BadInput, HyrlError, brief
 from hyrl_mj.gym_import import fingerprint as written
-from hyrl_mj.gym_import.chain import Chain
 from hyrl_mj.gym_import.expressions import entry
 from hyrl_mj.gym_import.observations import flat, observers, shaped
 from hyrl_mj.gym_import.opening import checked_step, made, peeled, physics_of, steps_of
+from hyrl_mj.gym_import.pausing import Pausing
 from hyrl_mj.gym_import.physics import Physics, set_pins
 from hyrl_mj.gym_import.specification import Derived, EnvironmentSpec
 from hyrl_mj.system.generators import global_state
+
+
+class Seen(NamedTuple):
+    """A sample of a run: MuJoCo's state (S,) after it, the observation (o,), and the report (r,)."""
+
+    state: np.ndarray
+    observation: np.ndarray
+    report: Sequence[float]
 
 
 class Instance:
@@ -45,12 +53,15 @@ class Instance:
         inner_seen: what the innermost environment observed last.
         draws_globally: whether a reset has drawn from a global generator.
         start: the state of MuJoCo to which the innermost reset has to lead, below wrappers.
+        tamper: changes, in a trial, all but the observation before wrappers get it; these may then write to a
+            state that noise has moved, too.
 
     Raises:
         BadInput: it cannot be made or reset.
     """
 
     def __init__(self, spec: EnvironmentSpec, real: bool = False):
+        self._thread: Pausing | None = None  # first, because it says why there can be no copy
         env = made(spec.description)
         physics = physics_of(env)
         assert physics is not None
@@ -69,11 +80,12 @@ class Instance:
         self.start: np.ndarray | None = None
         self._like: written.Fingerprint | None = None  # after its first reset
         self._begun = written.Fingerprint()  # after the reset of its episode
-        self._used = self._at_start = False
-        self.draws_globally = False
+        self.draws_globally = self._at_start = False
         self._samples = 0
         self._pairs: list[tuple[np.ndarray, np.ndarray]] = []
-        self._chain = Chain(self) if self.is_wrapped else None
+        self.tamper: Callable[[tuple[Any, ...]], tuple[Any, ...]] | None = None
+        if self.is_wrapped:
+            self._put_in()
 
     def learn(self, **facts: Any) -> None:
         """Adds to what is known of the environment."""
@@ -144,15 +156,31 @@ class Instance:
         """
         if not self.is_wrapped:
             self.reset(seed)
-        return self.rested(state, seed, noise)
-
-    def rested(
-        self, start: np.ndarray, seed: int | None = None, noise: np.ndarray | None = None
-    ) -> np.ndarray:
-        """Returns what is first observed (o,) of an episode that begins at a state of MuJoCo (S,)."""
-        self.begin(start, seed)
-        self.sense(np.zeros(self.spec.dimension) if noise is None else noise)
+        self.begin(state, seed)
+        self.sense(noise)
         return self.observation
+
+    def play(
+        self,
+        start: np.ndarray,
+        inputs: Iterable[np.ndarray],
+        noises: np.ndarray,
+        seed: int | None = None,
+    ) -> Iterator[Seen]:
+        """Yields what is seen of a run at its start, and after each sample.
+
+        Args:
+            start: MuJoCo's state (S,).
+            inputs: (k, m) of the samples.
+            noises: (k + 1, d) on the coordinates of the chart.
+            seed: of the reset, by default the one that all runs begin from.
+        """
+        yield Seen(start, self.put(start, seed, noises[0]), ())
+        for u, noise in zip(inputs, noises[1:], strict=True):
+            self.act(u)
+            state = self.physics.read()  # as the environment itself has left it
+            self.sense(noise)
+            yield Seen(state, self.observation, self.report)
 
     def arrive(self, state: np.ndarray) -> None:
         """Puts the innermost environment to a start (S,), and has it observe."""
@@ -180,11 +208,6 @@ class Instance:
         self.physics.write(state)
         self._samples = 0  # the time limit of an episode is no part of a state
 
-    def tamper(self, change: Any) -> None:
-        """Changes what wrappers get beside the observation, in a trial; see `Chain`."""
-        assert self._chain is not None
-        self._chain.tamper = change
-
     def mark(self) -> str:
         """Notes what is remembered after a reset; returns what is not as after the first, "" if all is."""
         self._begun = self.remembered()
@@ -198,35 +221,35 @@ class Instance:
             What of it is not like a new one, so that it can play no other; "" if all is.
         """
         self.quit()
-        if not self.spec.anew:
-            self.reset()
-            return self.mark()
-        worn, self._used, self._begun = self._used, True, written.shared(self.env)
-        return "a wrapper" if worn else ""
+        if self.spec.anew:
+            self._begun = written.shared(self.env)
+            return ""
+        self.reset()
+        return self.mark()
 
     def begin(self, start: np.ndarray, seed: int | None = None) -> None:
         """Begins an episode at a state of MuJoCo (S,); with wrappers, `sense` gives its first observation."""
-        if self._chain is None:
+        if self._thread is None:
             self.arrive(start)
             self.observation = self._flat(self.inner_seen)
         else:
             self.start = start
-            self._chain.ask(lambda: self.reset(seed))
+            self._ask(lambda: self.reset(seed))
 
     def act(self, u: np.ndarray) -> None:
         """Steps the environment with inputs u (m,); with wrappers, `sense` gives what it comes to."""
-        if self._chain is None:
+        if self._thread is None:
             self.take(self.stepped(u))
         else:
-            self._chain.ask(lambda: self.stepped(u))
+            self._ask(lambda: self.stepped(u))
 
-    def sense(self, noise: np.ndarray) -> None:
-        """Has the environment observe under noise (d,) on the chart's coordinates."""
-        if self._chain is None:
-            if noise.any():
+    def sense(self, noise: np.ndarray | None = None) -> None:
+        """Has the environment observe under noise (d,) on the chart's coordinates, by default none."""
+        if self._thread is None:
+            if noise is not None and noise.any():
                 self.observation = self._flat(self.displaced(noise))
             return
-        result = self._chain.answer(noise)
+        result = self._answer(noise)
         if self.start is None:
             self.take(result)
         else:
@@ -256,9 +279,110 @@ class Instance:
 
     def quit(self) -> None:
         """Leaves an episode before its end."""
-        if self._chain is not None:
-            self._chain.leave()
-            self.start = None
+        if self._thread is not None and self._thread.busy:
+            self._answer(None)
+        self.start = None
+
+    # ---- below wrappers
+
+    def _put_in(self) -> None:
+        """Puts a step and a reset into the innermost environment that pause for the noise of a sample."""
+        inner = self.inner
+        self._own_step, self._own_reset = inner.step, inner.reset
+        self._resetting = False  # its own reset may step it
+        self._calls = 0  # of the step, in a sample
+        self._shown: np.ndarray | None = (
+            None  # the state that wrappers see, if it is not the true one
+        )
+        try:
+            inner.step, inner.reset = self._inner_step, self._inner_reset
+        except Exception as error:
+            raise BadInput(
+                f"{self.name} allows no attributes beside its own ({brief(error)}), and noise comes in "
+                "by its step() below the wrappers: let it allow them, or leave the wrappers out"
+            ) from error
+        self._thread = Pausing()
+
+    def _ask(self, work: Callable[[], Any]) -> None:
+        """Begins a step or a reset, up to where the innermost environment would observe."""
+        assert self._thread is not None
+        self._calls = 0
+        self._thread.begin(work)
+        if not self._thread.busy:
+            raise BadInput(
+                f"a wrapper of {self.name} does not step the environment in each of its steps: leave it out"
+            )
+
+    def _answer(self, noise: np.ndarray | None) -> Any:
+        """Goes on with noise (d,) to the end of the step or reset, and returns its result."""
+        assert self._thread is not None
+        try:
+            result = self._thread.go_on(noise)
+        finally:
+            wrote = self._come_back()
+        if wrote and self.tamper is None:
+            raise BadInput(
+                f"a wrapper of {self.name} reads MuJoCo's state for what it observes, and writes to it: let "
+                "it observe what the environment gives it, or let only the environment write"
+            )
+        return result
+
+    def _come_back(self) -> bool:
+        """Puts the true state back if wrappers have seen another one; returns whether they wrote to it."""
+        if self._shown is None:
+            return False
+        now, shown, self._shown = self.physics.read(), self._shown, None
+        wrote = (now != shown) & ~(np.isnan(now) & np.isnan(shown))
+        self.physics.come_back()
+        if wrote.any():
+            state = self.physics.read()
+            state[wrote] = now[wrote]
+            self.physics.show(state)
+        return bool(wrote.any())
+
+    def _inner_step(self, action: Any) -> Any:
+        result = self._own_step(action)
+        if self._resetting:
+            return result
+        self.inner_seen = result[0]
+        return self._observed(result[0], result[1:])
+
+    def _inner_reset(self, **options: Any) -> Any:
+        self._resetting = True
+        try:
+            result = self._own_reset(**options)
+        finally:
+            self._resetting = False
+        self.inner_seen = result[0]
+        if self.start is None:
+            return result
+        self.pin()
+        self.arrive(self.start)
+        return self._observed(self.inner_seen, result[1:])
+
+    def _observed(self, observation: Any, rest: tuple[Any, ...]) -> tuple[Any, ...]:
+        """Returns what wrappers get of a step or a reset: in a sample, after its noise is known."""
+        assert self._thread is not None
+        if not self._thread.busy:
+            return (observation, *rest)
+        if self.tamper is not None:
+            rest = self.tamper(rest)
+        self._calls += 1
+        if self._calls > 1:
+            raise BadInput(
+                f"a wrapper of {self.name} steps or resets the environment more than once in a step, and "
+                "noise comes once a sample: give the environment a frame_skip instead"
+            )
+        noise = self._thread.pause()
+        if noise is not None and noise.any():
+            observation = self.displaced(noise)
+            if self.spec.sensing:
+                # Wrappers that read MuJoCo's state for what they observe see it where the sensor does.
+                shown = self.moved(self.physics.read(), noise)
+                self.physics.leave()
+                self.physics.write(shown)
+                self._shown = self.physics.read()
+        return (observation, *rest)
 
     # ---- what it observes
 
@@ -296,11 +420,9 @@ class Instance:
         state, space = self.physics.read(), self.inner.observation_space
         derived: Derived = "now" if self._at_start else self.spec.derived
         given = flat(self.inner_seen, space)
-        self.physics.leave()
-        seen = self._seen(derived, state, noise)
+        seen = self.seen_as(derived, state, noise)
         if derived == "unknown":
-            seen = given + (seen - self._seen("now", state, np.zeros(len(noise))))
-        self.physics.come_back()
+            seen = given + (seen - self.seen_as("now", state, np.zeros(len(noise))))
         again = flat(self.watched(), space)
         if again.tobytes() != given.tobytes() and not np.array_equal(again, given, equal_nan=True):
             column = int(((again != given) & ~(np.isnan(again) & np.isnan(given))).argmax())
@@ -313,20 +435,16 @@ class Instance:
 
     def seen_as(self, derived: Derived, state: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Returns the innermost observation (o,) of a state (S,) under noise (d,), as `derived` says."""
-        self.physics.leave()
-        seen = self._seen(derived, state, noise)
-        self.physics.come_back()
-        return seen
-
-    def _seen(self, derived: Derived, state: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Does what `seen_as` does, and stays in the state."""
         moved = self.moved(state, noise)
+        self.physics.leave()
         if derived == "earlier":
             self.physics.write(self.moved(self.physics.earlier(state), noise))
             self.physics.show(moved)
         else:
             self.physics.write(moved)
-        return flat(self.watched(), self.inner.observation_space)
+        seen = flat(self.watched(), self.inner.observation_space)
+        self.physics.come_back()
+        return seen
 
     def moved(self, state: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Returns a state of MuJoCo (S,) with noise (d,) added to the coordinates of the chart."""
@@ -358,7 +476,7 @@ class Instance:
         except HyrlError:
             raise
         except (Exception, SystemExit) as error:
-            if "SimpleQueue" in str(error):  # of the chain below the wrappers
+            if "SimpleQueue" in str(error):  # of what pauses below the wrappers
                 raise BadInput(
                     f"a wrapper of {self.name} copies the environment, and noise reaches no copies: let it "
                     "look ahead in an environment of its own"
@@ -387,7 +505,7 @@ class Instance:
         observation, reward, terminated, truncated, info = result
         self.observation = self._flat(observation)
         # The limit of `steps`, or that of a wrapper which episodes are played without.
-        over = self._samples == self.spec.max_steps and self.spec.criterion.asks("truncated")
+        over = self._samples == self.spec.max_steps and "truncated" in self.spec.criterion.asked
         truncated = bool(truncated) or over
         touch = bool(terminated) and bool(
             self.physics.touched(self.spec.solid) - self.spec.harmless

@@ -86,7 +86,10 @@ def from_gymnasium(
     }
     with described(_shown(env)):
         description = Description(**given)
-        told = given | {"env": env if isinstance(env, str) else {"function": _where(env)}}
+        told = dict(given)
+        if not isinstance(env, str):
+            name = getattr(env, "__qualname__", type(env).__qualname__)
+            told["env"] = {"function": f"{getattr(env, '__module__', '')}.{name}"}
         if starts == "chart":
             del told["starts"]
         spec = ENVIRONMENT + json.dumps(told, default=_plain)
@@ -107,24 +110,13 @@ def from_gymnasium(
         _RECENT.append(task)
     if isinstance(env, str):
         trust.remember_text(_recorded(spec, told))
-        if (module := _module_of(env)) is not None:
+        if ":" in env and (module := trust.module_file(env)) is not None:
             trust.remember(module)
     return task
 
 
 def _shown(env: Any) -> str:
     return f"the environment {env[:80]}" if isinstance(env, str) else "the environment"
-
-
-def _module_of(env: str) -> Path | None:
-    """Returns the file of the module of an id as "my_module:Puck-v0", if it is found."""
-    return trust.module_file(env) if ":" in env else None
-
-
-def _where(function: Callable[..., gym.Env]) -> str:
-    """Returns where a function is defined: "my_module.make"."""
-    name = getattr(function, "__qualname__", type(function).__qualname__)
-    return f"{getattr(function, '__module__', '')}.{name}"
 
 
 def _made_of(description: Description) -> tuple[Any, ...]:
@@ -214,7 +206,7 @@ def _check_received(env: str, given: Mapping[str, Any], spec: str) -> None:
     its reset are numbers and plain words.
     """
     if ":" in env:
-        module = _module_of(env)
+        module = trust.module_file(env)
         known = module is not None and trust.is_known(module)
     else:
         register(env)

@@ -25,7 +25,6 @@ class Physics:
         self.model, self.data = model, data
         self.size = mujoco.mj_stateSize(model, STATE)
         self._kept: mujoco.MjData | None = None
-        self._left = False
 
     @cached_property
     def columns(self) -> dict[str, np.ndarray]:
@@ -38,9 +37,9 @@ class Physics:
                 found[name], at = np.arange(at, at + size), at + size
         return found
 
-    def read(self, into: np.ndarray | None = None) -> np.ndarray:
-        """Returns MuJoCo's state (S,), a new array or one that is given."""
-        state = np.empty(self.size) if into is None else into
+    def read(self) -> np.ndarray:
+        """Returns MuJoCo's state (S,), a new array."""
+        state = np.empty(self.size)
         mujoco.mj_getState(self.model, self.data, state, STATE)
         return state
 
@@ -80,13 +79,10 @@ class Physics:
         """Notes everything, derived quantities included, for `come_back`."""
         self._kept = self._kept or mujoco.MjData(self.model)
         mujoco.mj_copyData(self._kept, self.model, self.data)
-        self._left = True
 
     def come_back(self) -> None:
-        """Puts everything back as it was at `leave`, if that was called."""
-        if self._left:
-            mujoco.mj_copyData(self.data, self.model, self._kept)
-            self._left = False
+        """Puts everything back as it was at `leave`."""
+        mujoco.mj_copyData(self.data, self.model, self._kept)
 
 
 def set_pins(env: Any, data: mujoco.MjData, pinned: Mapping[str, Any], name: str) -> None:

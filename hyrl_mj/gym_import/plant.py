@@ -12,7 +12,6 @@ import numpy as np
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.gym_import.pool import Pool
-from hyrl_mj.gym_import.specification import EnvironmentSpec
 from hyrl_mj.physics import mjcf
 from hyrl_mj.physics.plant import MOST, checked, checked_inputs
 from hyrl_mj.ranges import Integer
@@ -30,7 +29,6 @@ class EnvironmentPlant:
     sample before it is stepped; a run that is stepped without has none.
 
     Args:
-        spec: what is known of the environment.
         pool: plays the runs.
         model: of MuJoCo.
         n: number of runs.
@@ -39,12 +37,10 @@ class EnvironmentPlant:
 
     invertible = False
 
-    def __init__(
-        self, spec: EnvironmentSpec, pool: Pool, model: Any, n: int, written: bool = False
-    ):
+    def __init__(self, pool: Pool, model: Any, n: int, written: bool = False):
         self.n = Integer(1, MOST).checked("the number of copies of a robot", n)
-        self._written = written
-        self.spec, self._pool, self.model = spec, pool, model
+        self.spec, self._pool, self.model, self._written = pool.spec, pool, model, written
+        spec = self.spec
         self.low, self.high, self.late = spec.low, spec.high, spec.wrapped
         self._runs, self._places = next(_NUMBERS) * MOST + np.arange(n), pool.places(n)
         self._state = np.tile(spec.state, (n, 1))
@@ -63,7 +59,7 @@ class EnvironmentPlant:
     def measurement(self) -> np.ndarray:
         """The current measurement (n, p), a copy; what no noise was given for is observed without."""
         if self.spec.wrapped:
-            self._sense(np.flatnonzero(self._open & self._plays))
+            self._sense(np.flatnonzero(self._plays))
         return self._truth.copy()
 
     def truth(self, ids: np.ndarray) -> np.ndarray:
@@ -77,22 +73,23 @@ class EnvironmentPlant:
         """
         d, measured = self.spec.dimension, true.copy()
         needed = noise[:, :d].any(axis=1) | self.spec.wrapped
-        some = np.flatnonzero(needed & self._open[ids] & (self._outcome[ids] == Outcome.RUNNING))
-        self._sense(ids[some], noise[some, :d])
+        self._sense(ids[needed], noise[needed, :d])
         self._open[ids] = False
         measured[:, :d] += noise[:, :d]
         measured[:, self._seen] = self._truth[ids, self._seen]
         return measured
 
     def _sense(self, rows: np.ndarray, noise: np.ndarray | None = None) -> None:
-        """Has runs (k,) observe under noise (k, d), by default none."""
+        """Has runs (k,) that go on, and have not observed yet, do so under noise (k, d), by default none."""
+        waits = self._open[rows] & (self._outcome[rows] == Outcome.RUNNING)
+        noise = np.zeros((len(rows), self.spec.dimension)) if noise is None else noise
+        rows, noise = rows[waits], noise[waits]
         if not len(rows):
             return
         if self._written:
             raise BadInput(
                 f"{self.spec.name} cannot be observed under noise where states are written"
             )
-        noise = np.zeros((len(rows), self.spec.dimension)) if noise is None else noise
         begun = self._plays[rows]
         self._begin(rows)
         seen, reports = self._ask("sense", rows, noise)
@@ -187,7 +184,7 @@ class EnvironmentPlant:
         rows = self._rows(ids)
         u = checked_inputs(u, self.low, self.high, rows, self.spec.name)
         if self.spec.wrapped and not self._written:  # what the last step came to may be an end
-            self._sense(rows[self._open[rows] & self._plays[rows]])
+            self._sense(rows)
         # A run that is over stays where it ended.
         goes_on = (self._outcome[rows] == Outcome.RUNNING) & ~self._unstable[rows]
         rows, u = rows[goes_on], u[goes_on]
@@ -196,8 +193,6 @@ class EnvironmentPlant:
         if self._written:
             states, seen, reports = self._pool.scatter("branch", self._state[rows], u)
         else:
-            if self.spec.wrapped:
-                self._sense(rows[self._open[rows]])
             self._begin(rows)
             states, seen, reports = self._ask("act", rows, u)
         self._open[rows] = True

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -16,6 +15,8 @@ from hyrl_mj.gym_import.opening import Description
 from hyrl_mj.sets import Chart
 from hyrl_mj.tasks import Outcome
 
+# By how much coordinates are moved to see what follows them, as a share of the side of the chart.
+MOVED = 1e-3
 # What derived quantities are, as what is observed after a step shows them: as at the end of the step; as a
 # step of the physics before; or neither.
 Derived = Literal["now", "earlier", "unknown"]
@@ -75,25 +76,24 @@ class Criterion:
     @property
     def ends(self) -> bool:
         """Whether a success ends the episode."""
-        return bool(self.success.keys) or self.success.needs("terminated")
+        of_info = any(name[0] == "info" for name in self.success.asked)
+        return of_info or self.success.needs("terminated")
 
-    def asks(self, name: str) -> bool:
-        """Returns whether a condition asks for a name, such as "truncated"."""
-        return any(re.search(rf"\b{name}\b", one.text) for one in self._conditions)
+    @cached_property
+    def asked(self) -> tuple[Any, ...]:
+        """The names that its conditions need; see `Expression`."""
+        failure = () if self.failure is None else self.failure.asked
+        return tuple(dict.fromkeys((*self.success.asked, *failure)))
 
     @cached_property
     def keys(self) -> tuple[Path, ...]:
         """The entries of `info` that it needs."""
-        return tuple(dict.fromkeys(key for one in self._conditions for key in one.keys))
+        return tuple(name[1] for name in self.asked if name[0] == "info")
 
     @cached_property
     def places(self) -> tuple[tuple[str, str], ...]:
         """The pairs of names whose distance it needs."""
-        return tuple(dict.fromkeys(pair for one in self._conditions for pair in one.places))
-
-    @property
-    def _conditions(self) -> tuple[Expression, ...]:
-        return (self.success,) if self.failure is None else (self.success, self.failure)
+        return tuple(name[1:] for name in self.asked if name[0] == "distance")
 
     def verdict(self, success: np.ndarray) -> np.ndarray:
         """Returns the `Outcome` (n,) of episodes that are cut off where `success` (n,) holds or not."""
@@ -232,6 +232,15 @@ class EnvironmentSpec:
     def offset(self) -> np.ndarray:
         """What the coordinates of the chart are greater by than these entries of a state: (d,)."""
         return np.array([c.offset for c in self.coordinates])
+
+    @cached_property
+    def nudge(self) -> np.ndarray:
+        """By how much coordinates with noise are moved to see what follows them: (d,)."""
+        return MOVED * self.chart.sides * (np.array(self.noisy) > 0)
+
+    def anywhere(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        """Returns chart points (n, d) at random, of those where runs begin."""
+        return rng.uniform(self.start_low, self.start_high, (n, self.dimension))
 
     def z(self, state: np.ndarray) -> np.ndarray:
         """Returns the chart points (n, d) of MuJoCo's states (n, S)."""

@@ -119,7 +119,9 @@ class Stage:
         for start in starts:
             if self._resting is None or self.spec.wrapped:
                 self._resting = self._renewed([self._resting] if self._resting else [])
-            seen.append(self._resting.rested(start))
+            self._resting.begin(start)
+            self._resting.sense()
+            seen.append(self._resting.observation)
             depths.append(self._resting.physics.depth(self.spec.solid))
         return np.array(seen), np.array(depths)
 
@@ -160,23 +162,23 @@ class Stage:
         self, instances: Sequence[Instance], u: np.ndarray, begun: np.ndarray | None = None
     ) -> Arrays:
         """Steps instances with inputs (k, m), from where they are or from states (k, S) written before."""
-        first = instances[0]
-        states, seen = (np.empty((len(u), n)) for n in (first.physics.size, len(first.observation)))
-        reports = []
-        with first.undrawn():
+        states, seen, reports = [], [], []
+        with instances[0].undrawn():
             for i, (instance, inputs) in enumerate(zip(instances, u, strict=True)):
                 if begun is not None:
                     instance.jump(begun[i])
                 instance.act(inputs)
-                instance.physics.read(states[i])
-                seen[i] = instance.observation
+                states.append(instance.physics.read())
+                seen.append(instance.observation)
                 reports.append(instance.report)
-        return states, seen, np.array(reports, dtype=float)
+        return np.array(states), np.array(seen), np.array(reports, dtype=float)
 
     # ---- instances
 
     def _renewed(self, spare: list[Instance], real: bool = False) -> Instance:
         """Returns an instance that can begin an episode: a spare one, or a new one if these are worn."""
+        if self.spec.anew:  # each plays one
+            spare.clear()
         while True:
             instance = spare.pop() if spare else self._new(real)
             if not (worn := instance.renew()):
@@ -210,17 +212,13 @@ def judge(run: Played, real: Instance, noise: np.ndarray) -> None:
         BadInput: the run went otherwise.
     """
     spec, heard = real.spec, noise is run.noise
-    observations, path, reports = [real.put(run.start, noise=noise[0])], [run.path[0]], []
-    for u, of_sample in zip(run.inputs, noise[1:], strict=True):
-        real.act(u)
-        path.append(spec.z(real.physics.read()[None])[0])
-        real.sense(of_sample)
-        observations.append(real.observation)
-        reports.append(real.report)
+    samples = [*real.play(run.start, run.inputs, noise)]
     real.finish()
-    if not reports or (not heard and not np.array_equal(path, run.path)):
+    states, observations, reports = zip(*samples, strict=True)
+    path = np.vstack([run.path[:1], spec.z(np.array(states[1:]).reshape(-1, len(run.start)))])
+    if len(samples) == 1 or (not heard and not np.array_equal(path, run.path)):
         return
-    told = np.array(reports, dtype=float)
+    told = np.array(reports[1:], dtype=float)
     if heard:
         seen = observations[: len(run.observations)]
         _compare(real.name, "observation", run.observations, seen)

@@ -18,7 +18,6 @@ from hyrl_mj.gym_import.observations import parts_of
 from hyrl_mj.gym_import.opening import code_of
 from hyrl_mj.gym_import.plant import EnvironmentPlant
 from hyrl_mj.gym_import.pool import Pool
-from hyrl_mj.gym_import.specification import EnvironmentSpec
 from hyrl_mj.gym_import.stage import Played
 from hyrl_mj.gym_import.trials import goes_on
 from hyrl_mj.physics import mjcf
@@ -51,16 +50,10 @@ class EnvironmentTask(Task):
     _original: Task | None = None
     learning = Learning()
 
-    def __init__(
-        self,
-        specification: EnvironmentSpec,
-        pool: Pool,
-        instance: Instance,
-        spec: str,
-        made_of: tuple[Any, ...],
-    ):
-        self.specification, self._pool, self._instance = specification, pool, instance
-        self.made_of = made_of
+    def __init__(self, pool: Pool, instance: Instance, spec: str, made_of: tuple[Any, ...]):
+        self.specification = specification = pool.spec
+        self._pool, self._instance, self.made_of = pool, instance, made_of
+        self.model = instance.model
         # What a task and a specification call alike.
         for name in (
             "name", "chart", "inputs", "start_low", "start_high", "max_steps", "dt", "worst_reward",
@@ -154,10 +147,6 @@ class EnvironmentTask(Task):
         return next((i for i, wraps in enumerate(self.chart.periodic) if wraps), None)
 
     @cached_property
-    def model(self) -> Any:
-        return self._instance.model
-
-    @cached_property
     def code(self) -> str:
         digest = sha256(b"".join(of_model(self.model).values()))
         digest.update("".join(code_of(self._instance.env)).encode())
@@ -170,10 +159,10 @@ class EnvironmentTask(Task):
         return types.pop() if len(types) == 1 else ""
 
     def plant(self, n: int, threads: int = 0) -> Any:
-        return EnvironmentPlant(self.specification, self._pool, self.model, n)
+        return EnvironmentPlant(self._pool, self.model, n)
 
     def tabulating(self, n: int) -> Any:
-        return EnvironmentPlant(self.specification, self._pool, self.model, n, written=True)
+        return EnvironmentPlant(self._pool, self.model, n, written=True)
 
     @cached_property
     def kinematic(self) -> bool:
@@ -186,7 +175,7 @@ class EnvironmentTask(Task):
         whole = sorted(c.index for c in spec.coordinates if c.kind == "qpos")
         if whole != list(range(self.model.nq)) or not (can.arrival_ends and can.restarts):
             return False
-        return goes_on(self._pool, spec, of_chart=True)
+        return goes_on(self._pool, of_chart=True)
 
     def verify(self, z0: np.ndarray, runs: Any, rows: Sequence[int] | np.ndarray) -> None:
         starts, d = self.specification.state_at(z0), self.chart.dimension
@@ -218,15 +207,11 @@ class EnvironmentTask(Task):
 
     def at(self, z: np.ndarray) -> np.ndarray:
         rest = np.tile([0.0, 0.0, float(Outcome.RUNNING)], (len(z), 1))
-        return np.column_stack(
-            [z, self._pool.scatter("rest", self.specification.state_at(z))[0], rest]
-        )
+        return np.column_stack([z, self._begun(z)[0], rest])
 
-    def _at_rest(self, z: np.ndarray) -> np.ndarray:
-        """Returns what a robot at rest at chart points (n, d) observes (n, o)."""
-        if (affine := self.specification.affine) is not None:
-            return np.asarray(np.column_stack([z, np.ones(len(z))]) @ affine)
-        return self._pool.scatter("rest", self.specification.state_at(z))[0]
+    def _begun(self, z: np.ndarray) -> Any:
+        """Returns what robots at rest at chart points (n, d) observe (n, o), and their depths (n,) [m]."""
+        return self._pool.scatter("rest", self.specification.state_at(z))
 
     def with_z(self, measured: np.ndarray, z: np.ndarray) -> np.ndarray:
         """Returns measurements (n, p) with what a robot at rest at chart points z (n, d) would observe.
@@ -236,10 +221,12 @@ class EnvironmentTask(Task):
         d = self.chart.dimension
         changed, found = np.flatnonzero((measured[:, :d] != z).any(axis=1)), measured.copy()
         if len(changed):
-            seen = self._at_rest(z[changed])
+            affine, z_now = self.specification.affine, z[changed]
+            one = np.column_stack([z_now, np.ones(len(z_now))])
+            seen = self._begun(z_now)[0] if affine is None else one @ affine
             moves = d + np.flatnonzero(self.specification.moves)
             found[changed[:, None], moves] = seen[:, self.specification.moves]
-            found[changed, :d] = z[changed]
+            found[changed, :d] = z_now
         return found
 
     def perturbed(self, measured: np.ndarray, noise: np.ndarray) -> np.ndarray:
@@ -277,8 +264,7 @@ class EnvironmentTask(Task):
     def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
         z = super().starts(n, rng)
         for _ in range(200):
-            _, depths = self._pool.scatter("rest", self.specification.state_at(z))
-            inside = np.flatnonzero(depths > self.specification.depth)
+            inside = np.flatnonzero(self._begun(z)[1] > self.specification.depth)
             if not len(inside):
                 return z
             z[inside] = super().starts(len(inside), rng)

@@ -14,13 +14,11 @@ from hyrl_mj.gym_import.instance import Instance
 from hyrl_mj.gym_import.observations import flat, observers
 from hyrl_mj.gym_import.plant import EnvironmentPlant
 from hyrl_mj.gym_import.pool import Pool
-from hyrl_mj.gym_import.specification import Derived, EnvironmentSpec
+from hyrl_mj.gym_import.specification import MOVED, Derived
 from hyrl_mj.gym_import.stage import Played
 
 # Episodes and samples of a trial, and for how many samples inputs are held.
 EPISODES, SAMPLES, HELD = 8, 40, 8
-# By how much coordinates are moved to see what follows them, as a share of the side of the chart.
-MOVED = 1e-3
 # Places on the chart from which runs of so many samples come to one state, which may show where they were;
 # from the first places longer ones, in which slow sensors measure.
 PLACES, AWAY, LONG = 64, 2, (SAMPLES, 120)
@@ -103,31 +101,26 @@ def _rounds(off: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.asarray(off <= 1e-9 * max(float(sizes.max(initial=0.0)), 1.0))
 
 
-def check_observer(instance: Instance, step: np.ndarray) -> None:
+def check_observer(instance: Instance) -> None:
     """Raises `BadInput` if what is observed in a state depends on where on the chart a run came from.
 
     Runs under the same inputs are put into one state. What they observe there has to be the same to the bit:
     what is stored on the way differs, if only by rounding.
-
-    Args:
-        instance: the environment.
-        step: (d,) by how much the coordinates of the chart are moved to see what follows them.
     """
-    spec, rng, name = instance.spec, np.random.default_rng(7), instance.name
-    usual: dict[int, np.ndarray] = {}
-    places = rng.uniform(spec.start_low, spec.start_high, (PLACES, spec.dimension))
-    runs = [(z, AWAY) for z in places]
-    runs += [(z, min(away, spec.max_steps)) for away in LONG for z in places[:EPISODES]]
-    for z, away in runs:
+    spec, name, usual = instance.spec, instance.name, dict[int, np.ndarray]()
+    states = spec.state_at(spec.anywhere(np.random.default_rng(7), PLACES))
+    runs = [(state, AWAY) for state in states]
+    runs += [(state, min(away, spec.max_steps)) for away in LONG for state in states[:EPISODES]]
+    for state, away in runs:
         instance.reset()
-        instance.physics.write(spec.state_at(z[None])[0])
+        instance.physics.write(state)
         if instance.physics.depth(instance.spec.solid) > spec.depth:
             continue
         if len([*instance.wander(np.random.default_rng(8), away, HELD)]) < away:
             continue
         if away != AWAY:
             before = instance.memory()
-            instance.displaced(step)
+            instance.displaced(spec.nudge)
             if changed := differing(instance.memory(), before):
                 raise BadInput(
                     f"{name} changes {changed[0]} when it computes what it observes, so that cannot be asked "
@@ -145,17 +138,14 @@ def check_observer(instance: Instance, step: np.ndarray) -> None:
             )
 
 
-def derived_of(instance: Instance, step: np.ndarray) -> tuple[Derived, list[int]]:
+def derived_of(instance: Instance) -> tuple[Derived, list[int]]:
     """Returns `derived` of a spec, and the columns of what is observed that are not from the end of a step.
-
-    Args:
-        instance: the environment.
-        step: (d,) by how much the coordinates of the chart are moved to see what follows them.
 
     Raises:
         BadInput: noise on the chart's coordinates moves columns of which it is not known when they are from.
     """
     rng, space = np.random.default_rng(5), instance.inner.observation_space
+    step = instance.spec.nudge
     off: dict[Derived, list[np.ndarray]] = {"now": [], "earlier": []}
     moving, size = [], []
     for seed in range(EPISODES):
@@ -195,10 +185,10 @@ def derived_of(instance: Instance, step: np.ndarray) -> tuple[Derived, list[int]
     return "unknown", lags
 
 
-def moving(pool: Pool, spec: EnvironmentSpec) -> tuple[np.ndarray, np.ndarray | None]:
+def moving(pool: Pool) -> tuple[np.ndarray, np.ndarray | None]:
     """Returns which columns of an observation at rest follow the chart (o,) bool, and `affine` of a spec."""
-    shape = EPISODES * (spec.dimension + 1), spec.dimension
-    z = np.random.default_rng(0).uniform(spec.start_low, spec.start_high, shape)
+    spec = pool.spec
+    z = spec.anywhere(np.random.default_rng(0), EPISODES * (spec.dimension + 1))
     seen, _ = pool.scatter("rest", spec.state_at(z))
     one = np.column_stack([z, np.ones(len(z))])
     fit = np.linalg.lstsq(one, seen, rcond=None)[0]
@@ -210,17 +200,17 @@ def moving(pool: Pool, spec: EnvironmentSpec) -> tuple[np.ndarray, np.ndarray | 
 
 
 def _runs(
-    pool: Pool, spec: EnvironmentSpec, seed: int, n: int = EPISODES
+    pool: Pool, seed: int, n: int = EPISODES
 ) -> Iterator[tuple[EnvironmentPlant, np.ndarray]]:
     """Yields n runs from starts at random, before each sample, with inputs (n, m) at random for it.
 
     Some starts are drawn more, and of these the ones that are free of walls come first.
     """
-    rng = np.random.default_rng(seed)
-    states = spec.state_at(rng.uniform(spec.start_low, spec.start_high, (3 * n, spec.dimension)))
+    rng, spec = np.random.default_rng(seed), pool.spec
+    states = spec.state_at(spec.anywhere(rng, 3 * n))
     _, depths = pool.scatter("rest", states)
     states = states[np.argsort(depths > spec.depth, kind="stable")[:n]]
-    plant = EnvironmentPlant(spec, pool, None, n)
+    plant = EnvironmentPlant(pool, None, n)
     plant.set_state(states[:, spec.qpos], states[:, spec.qvel])
     for k in range(min(SAMPLES, spec.max_steps)):
         if k % HELD == 0:
@@ -228,13 +218,14 @@ def _runs(
         yield plant, u if spec.levels is None else np.round(u)
 
 
-def check_instances(pool: Pool, spec: EnvironmentSpec) -> None:
+def check_instances(pool: Pool) -> None:
     """Raises `BadInput` unless instances go as new ones after other episodes, with noise and without."""
-    d, o, everyone = spec.dimension, spec.columns, np.arange(EPISODES)
+    spec, everyone = pool.spec, np.arange(EPISODES)
+    d, o = spec.dimension, spec.columns
     for seed, share in enumerate((0.0, 0.0, MOVED)):
         rng, bound = np.random.default_rng(seed), share * spec.chart.sides * spec.noisy
         starts, inputs, noises, told = [], [], [], []
-        for plant, u in _runs(pool, spec, 3 + seed):
+        for plant, u in _runs(pool, 3 + seed):
             starts.append(plant.state)
             noises.append(rng.uniform(-bound, bound, (EPISODES, d)))
             told.append(_observed(plant, noises[-1]))
@@ -277,16 +268,16 @@ def _observed(plant: EnvironmentPlant, noise: np.ndarray) -> np.ndarray:
     return found
 
 
-def goes_on(pool: Pool, spec: EnvironmentSpec, of_chart: bool = False) -> bool:
+def goes_on(pool: Pool, of_chart: bool = False) -> bool:
     """Returns whether runs go on from written states as they did, so that these are all there is.
 
     Args:
         pool: plays the runs.
-        spec: what is known of the environment.
         of_chart: whether the states at rest at the chart points of the runs are written, so that the chart is
             all there is; by default MuJoCo's states of the runs.
     """
-    for plant, u in _runs(pool, spec, 4, 48 if of_chart else EPISODES):
+    spec = pool.spec
+    for plant, u in _runs(pool, 4, 48 if of_chart else EPISODES):
         going = np.flatnonzero(plant.measurement[:, -1] == 0)
         before = plant.state[going]
         plant.step(u[going], going)

@@ -1,21 +1,33 @@
-"""Trials of what an environment does with its own observation, and with the place of its reset."""
+"""Trials of what tells an environment or its wrappers the place of the robot, past the noise.
+
+Its own `step` may use what it observes, and go by where its reset led to. Wrappers may look at `info`, at
+attributes, and at MuJoCo's state.
+"""
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import mujoco
 import numpy as np
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.gym_import.fingerprint import differing
-from hyrl_mj.gym_import.instance import Instance
+from hyrl_mj.gym_import.fingerprint import DEEPEST, FUNCTIONS, differing, has_no_memory
+from hyrl_mj.gym_import.instance import Instance, Seen
 from hyrl_mj.gym_import.observations import flat
 from hyrl_mj.gym_import.specification import EnvironmentSpec
-from hyrl_mj.gym_import.trials import EPISODES, HELD, SAMPLES
+from hyrl_mj.gym_import.trials import EPISODES, HELD, PLACES, SAMPLES
+
+# What changes by this share of a displacement follows the place [share].
+FOLLOWS = 0.01
+
+# What an environment tells beside its observation, by name.
+Told = dict[str, Any]
 
 
 class _Sensor:
@@ -68,9 +80,6 @@ def check_use(spec: EnvironmentSpec) -> None:
     The same runs are played with an observer that sees the true place, and with one that sees others, all
     over the chart. What the latter gives has to be returned, and both runs have to go the same way. Wrappers
     give the actions of a run without noise.
-
-    Args:
-        spec: what is known of the environment.
     """
     inner = Instance(spec).inner
     if not hasattr(type(inner), spec.observer) or spec.observer in getattr(
@@ -81,8 +90,7 @@ def check_use(spec: EnvironmentSpec) -> None:
     actions: list[Any] = []
     wrapped.inner.step = _noting(wrapped.inner.step, actions)
     rng, half = np.random.default_rng(10), spec.chart.sides * (np.array(spec.noisy) > 0) / 2
-    for z in rng.uniform(spec.start_low, spec.start_high, (EPISODES, spec.dimension)):
-        state = spec.state_at(z[None])[0]
+    for state in spec.state_at(spec.anywhere(rng, EPISODES)):
         wrapped.reset()
         wrapped.arrive(state)
         if not (true.put(state) and noisy.put(state)):
@@ -135,41 +143,33 @@ def check_noted(spec: EnvironmentSpec) -> None:
     They are played after the reset as it is, and after one that leads to the start itself, because what it
     computes with mj_forward is computed there. Both have to go alike, to their ends and under inputs that do
     not change, which lead far away.
-
-    Args:
-        spec: what is known of the environment.
     """
     if spec.description.starts == "reset":
         return
     rng, usual, led = np.random.default_rng(11), Instance(spec), Instance(spec)
-    for z in rng.uniform(spec.start_low, spec.start_high, (EPISODES, spec.dimension)):
-        state = spec.state_at(z[None])[0]
-        usual.put(state)
+    none = np.zeros((spec.max_steps + 1, spec.dimension))
+    first = 0 if "reward" in spec.criterion.asked else 1  # of the report, by which it is judged
+    for state in spec.state_at(spec.anywhere(rng, EPISODES)):
+        inputs = [usual.drawn(rng)] * spec.max_steps
+        ours, theirs = (one.play(state, inputs, none) for one in (usual, led))
+        next(ours)
         with _leading(led, state):
-            led.put(state)
+            next(theirs)
         noted = differing(led.memory(), usual.memory())
         if not noted:
             return
         if usual.physics.depth(spec.solid) > spec.depth:
             continue
-        u = usual.drawn(rng)
-        for _ in range(spec.max_steps):
-            if not np.array_equal(_told(usual, u), _told(led, u), equal_nan=True):
+        for pair in zip(ours, theirs, strict=True):
+            a, b = (np.concatenate([*seen[:2], seen.report[first:]]) for seen in pair)
+            if not np.array_equal(a, b, equal_nan=True):
                 raise BadInput(
                     f"reset() of {spec.name} notes where it leads to ({noted[0]}), and step() goes by that, "
                     "so a start elsewhere on the chart is none of its own: let the first step() note it, or "
                     "give starts='reset'"
                 )
-            if usual.report[1] or usual.report[2]:
+            if any(pair[0].report[1:3]):
                 break
-
-
-def _told(instance: Instance, u: np.ndarray) -> np.ndarray:
-    """Returns numbers (k,) that tell how a step with inputs u (m,) went, and what it is judged by."""
-    instance.act(u)
-    instance.sense(np.zeros(instance.spec.dimension))
-    judged = instance.report[0 if instance.spec.criterion.asks("reward") else 1 :]
-    return np.concatenate([instance.physics.read(), instance.observation, judged])
 
 
 @contextmanager
@@ -189,3 +189,173 @@ def _leading(instance: Instance, state: np.ndarray) -> Iterator[None]:
         yield
     finally:
         mujoco.mj_forward = own
+
+
+# ---- wrappers
+
+
+def changes_by_reset(spec: EnvironmentSpec) -> bool:
+    """Returns whether the start of a run is another one after a reset before, as with running statistics."""
+    found = []
+    for resets in (0, 0, 1):
+        instance = Instance(spec)
+        for _ in range(resets):
+            instance.reset()
+        observation = instance.put(spec.state)
+        found.append((observation, instance.remembered()))
+    usual = set(differing(found[0][1], found[1][1]))  # such as names of files
+    changed = set(differing(found[0][1], found[2][1])) - usual
+    return bool(changed) or not np.array_equal(found[0][0], found[2][0], equal_nan=True)
+
+
+def check_told(spec: EnvironmentSpec) -> None:
+    """Raises `BadInput` if wrappers observe what `info` or attributes of the environment tell of the place.
+
+    Runs are played from places on the chart, and from places that are displaced. What the environment tells
+    in the latter is then put into the former, whose observation has to stay the same.
+    """
+    rng, step = np.random.default_rng(9), spec.nudge
+    least = FOLLOWS * float(step[step > 0].min(initial=np.inf))
+    usual, other = Instance(spec), Instance(spec)
+    for z in spec.anywhere(rng, 6):
+        inputs, none = [usual.drawn(rng) for _ in range(2)], np.zeros((3, spec.dimension))
+        state, displaced = spec.state_at(np.array([z, z + step]))
+        plain = _run(usual, state, inputs, none)
+        elsewhere = _run(other, displaced, inputs, none)
+        if len(plain) != len(elsewhere):
+            continue
+        follow = [
+            {name: there[name] for name in here if _far(here[name], there.get(name), least)}
+            for (_, here), (_, there) in zip(plain, elsewhere, strict=True)
+        ]
+        if not any(follow):
+            continue
+        changed = _run(Instance(spec), state, inputs, none, changes=follow)
+        for (seen, _), (now, _), names in zip(plain, changed, follow, strict=False):
+            if not np.array_equal(seen.observation, now.observation, equal_nan=True):
+                raise BadInput(
+                    f"a wrapper of {spec.name} observes {' or '.join(names)}, which follows the place and "
+                    "which noise does not reach: let it observe what the environment observes"
+                )
+            if names:
+                break  # from here on the run may be another one
+
+
+def senses(spec: EnvironmentSpec) -> bool:
+    """Returns whether wrappers read MuJoCo's state for what they observe.
+
+    The same runs under noise are played twice, once with the true state shown to the wrappers, and once with
+    the state where the noise shows the robot.
+
+    Raises:
+        BadInput: wrappers do, and tell from that state as well how the episode goes.
+    """
+    rng, differ = np.random.default_rng(6), {"observation": False, "report": False}
+    places, step = spec.anywhere(rng, PLACES), spec.nudge
+    starts = [(spec.state, min(SAMPLES, spec.max_steps))] * EPISODES
+    starts += [(state, min(3, spec.max_steps)) for state in spec.state_at(places)]
+    both = [Instance(replace(spec, sensing=sensing)) for sensing in (False, True)]
+    for seed, (start, samples) in enumerate(starts):
+        noises = rng.uniform(-step, step, (samples + 1, len(step)))
+        drawn = [both[0].drawn(rng) for _ in range(samples)]
+        inputs = [drawn[k - k % HELD] for k in range(samples)]
+        true, shown = (_run(one, start, inputs, noises, seed % EPISODES) for one in both)
+        for what in differ:
+            differ[what] |= any(
+                not np.array_equal(getattr(a, what), getattr(b, what), equal_nan=True)
+                for (a, _), (b, _) in zip(true, shown, strict=False)  # one may have ended before
+            )
+    if all(differ.values()):
+        raise BadInput(
+            f"a wrapper of {spec.name} reads MuJoCo's state for what it observes, which noise moves, and for "
+            "its reward, its info or the end of an episode, which it must not: let it observe what the "
+            "environment gives it, or let only the environment judge"
+        )
+    return differ["observation"]
+
+
+def _run(
+    instance: Instance,
+    start: np.ndarray,
+    inputs: Sequence[np.ndarray],
+    noises: np.ndarray,
+    seed: int | None = None,
+    changes: Sequence[Told] | None = None,
+) -> list[tuple[Seen, Told]]:
+    """Returns what is seen, and what wrappers are told, at the start of a run and after each of its samples.
+
+    Args:
+        instance: plays the run.
+        start: MuJoCo's state (S,).
+        inputs: (k, m) of the samples.
+        noises: (k + 1, d) on the coordinates of the chart.
+        seed: of the reset, by default the one that all runs begin from.
+        changes: what the environment is made to tell instead, by sample.
+    """
+    told: list[Told] = []
+
+    def tamper(rest: tuple[Any, ...]) -> tuple[Any, ...]:
+        new = {} if changes is None else changes[len(told)]
+        told.append(_told(instance.inner, rest[-1]))
+        info = dict(rest[-1])
+        for name, owner, key in [*_held(instance.inner, info)] if new else ():
+            if name in new:
+                owner[key] = copy.deepcopy(new[name])
+        return (*rest[:-1], info)
+
+    instance.tamper, found = tamper, []
+    for seen in instance.play(start, inputs, noises, seed):
+        found.append((seen, told[-1]))
+        if any(seen.report[1:3]):
+            break
+    return found
+
+
+def _told(inner: Any, info: Any) -> Told:
+    """Returns the numbers in `info` and in attributes of an environment, also within objects, by name."""
+    return {name: copy.deepcopy(owner[key]) for name, owner, key in _held(inner, dict(info))}
+
+
+def _held(inner: Any, info: dict[str, Any]) -> Iterator[tuple[str, Any, Any]]:
+    """Yields the name, the owner and the key of all numbers that an environment tells beside observing."""
+    seen = {id(inner)}
+    for kind, owner in (("info", info), ("attribute", getattr(inner, "__dict__", {}))):
+        yield from _within(owner, f"{kind} ", seen, 0)
+
+
+def _within(owner: Any, path: str, seen: set[int], depth: int) -> Iterator[tuple[str, Any, Any]]:
+    """Yields names, owners and keys of the numbers in a dictionary or a list, and in what it holds."""
+    for key, value in [*owner.items()] if isinstance(owner, dict) else [*enumerate(owner)]:
+        if _numbers(value) is not None:
+            yield f"{path}{key}", owner, key
+        elif depth < DEEPEST and id(value) not in seen:
+            seen.add(id(value))
+            parts = value
+            if isinstance(value, tuple | deque):
+                parts = [*value]
+            elif not isinstance(value, dict | list):
+                passed = isinstance(value, FUNCTIONS) or has_no_memory(value)
+                parts = {} if passed else getattr(value, "__dict__", {})
+            yield from _within(parts, f"{path}{key}.", seen, depth + 1)
+
+
+def _numbers(value: Any) -> np.ndarray | None:
+    """Returns the numbers (k,) that a value is, or all parts of a collection are; None if it holds others."""
+    if isinstance(value, dict):
+        value = [*value.values()]
+    if isinstance(value, list | tuple | deque):
+        parts = [_numbers(part) for part in value]
+        numbers = [part for part in parts if part is not None]
+        return np.concatenate(numbers) if 0 < len(numbers) == len(parts) else None
+    if not isinstance(value, int | float | np.number | np.ndarray):
+        return None
+    array = np.asarray(value)
+    return array.ravel().astype(float) if array.dtype.kind in "iuf" else None
+
+
+def _far(here: Any, there: Any, least: float) -> bool:
+    """Returns whether what is told at two places differs by as much as what follows the place does."""
+    a, b = _numbers(here), _numbers(there)
+    if a is None or b is None or len(a) != len(b):
+        return False
+    return bool(np.abs(a - b).max(initial=0.0) >= least)
