@@ -17,6 +17,11 @@ class Answer(NamedTuple):
     stderr: str
 
 
+def contents(path):
+    """The bytes of all files in a folder, by their paths."""
+    return {p: p.read_bytes() for p in sorted(path.rglob("*")) if p.is_file()}
+
+
 def call(*words, cwd="."):
     """Call `hyrl-mj` with these words in a folder."""
     out, err = io.StringIO(), io.StringIO()

@@ -1,7 +1,10 @@
 """Fixtures that many tests share: the registered tasks."""
 
+import ctypes
+import gc
 import json
 import os
+import platform
 import shutil
 
 # Before NumPy and torch are there: matrices are small here, and threads that wait for a busy core take
@@ -10,10 +13,12 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import hypothesis
+import memory
 import pytest
 from filelock import FileLock
 
 import hyrl_mj
+from hyrl_mj.system import cores
 from hyrl_mj.tasks.scaffold import write_task
 
 # The same examples everywhere, whatever the speed of the machine; `scripts/test --long` tries others, too.
@@ -30,6 +35,29 @@ def no_trace_at_home(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
         yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def own_cores():
+    """A process of several that test side by side takes its share: threads that wait for a busy core cost."""
+    with pytest.MonkeyPatch.context() as patch:
+        if "PYTEST_XDIST_WORKER_COUNT" in os.environ:
+            share = cores.count() // int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
+            patch.setattr(cores, "allowed", max(share, 1))
+        yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def memory_of_a_file():
+    """What the tests of a file have freed goes back to the system, if it is much: each fork copies less.
+
+    The simulations of hundreds of environments are freed in pieces between which others live, and glibc keeps
+    all of it.
+    """
+    yield
+    if platform.libc_ver()[0] == "glibc" and memory.now("VmRSS") > 600:
+        gc.collect()
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 @pytest.fixture(scope="session")

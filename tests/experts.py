@@ -1,10 +1,28 @@
-"""An expert rule for the robots with dynamics, which knows which side to take."""
+"""Rules for the robots with dynamics, an expert among them, which knows which side to take."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
 import hyrl_mj
+from hyrl_mj.policies.controllers import PolicyController
+from hyrl_mj.simulation.rollout import LoopSettings, closed_loop
+
+
+def moved(task, policy, z0, steps=None):
+    """Runs (n,) of a policy from chart points, quietly."""
+    settings = LoopSettings(steps=steps, quiet=True)
+    return closed_loop(task, PolicyController(policy), np.array(z0), settings=settings)
+
+
+class Constant:
+    """The same inputs for ever."""
+
+    def __init__(self, *u):
+        self.u = u
+
+    def act(self, measured):
+        return np.tile(self.u, (len(measured), 1)).astype(float)
 
 
 @dataclass(frozen=True)

@@ -11,14 +11,15 @@ class Peak:
     def __enter__(self) -> "Peak":
         if not Path("/proc/self/clear_refs").exists():
             pytest.skip("only Linux lets a process begin the count of its peak anew")
-        self.before = _memory("VmRSS")
+        self.before = now("VmRSS")
         Path("/proc/self/clear_refs").write_text("5")
         return self
 
     def __exit__(self, *error) -> None:
-        self.megabytes = _memory("VmHWM") - self.before
+        self.megabytes = now("VmHWM") - self.before
 
 
-def _memory(name: str) -> float:
+def now(name: str) -> float:
+    """What Linux says of the memory of this process under a name, as VmRSS [MB]."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) / 1024 for line in lines if line.startswith(name))

@@ -3,14 +3,13 @@
 import mujoco
 import numpy as np
 import pytest
+from experts import moved
 from planted import ChartPolicy
 
 import hyrl_mj
 from hyrl_mj import Outcome
 from hyrl_mj.gym_export import BatchedEnv, Domain
 from hyrl_mj.judging.game import Lattice
-from hyrl_mj.policies.controllers import PolicyController
-from hyrl_mj.simulation.rollout import LoopSettings, closed_loop
 from hyrl_mj.stages.critical_set import find_critical_set
 
 # Angle of the shoulder from which the elbow may turn all the way round beside the post [rad].
@@ -36,11 +35,6 @@ def folding(task, side=None):
         return np.stack([shoulder, elbow], axis=1) * task.input_limits[1]
 
     return ChartPolicy(task, rule)
-
-
-def turn(task, policy, z0):
-    settings = LoopSettings(quiet=True)
-    return closed_loop(task, PolicyController(policy), np.array(z0), settings=settings)
 
 
 def test_its_clearance_is_that_of_mujoco(arm):
@@ -109,14 +103,14 @@ def test_either_way_leads_to_the_goal_from_every_start(arm):
     z = arm.starts(500, np.random.default_rng(0))
     far = np.abs(arm.chart.difference(z, arm.set_point)[:, 1]) > 1.0
     for mode, side in enumerate((-1, 1)):
-        rollout = turn(arm, folding(arm, side), z)
+        rollout = moved(arm, folding(arm, side), z)
         assert (rollout.outcome == Outcome.REACHED).all()
         assert (arm.direction(rollout.path)[far] == mode).all()
 
 
 def test_runs_with_nothing_left_to_decide_have_no_way(arm):
     z = np.add(arm.set_point, [[1.5, 0.1], [-1.5, -0.1]])
-    assert arm.direction(turn(arm, folding(arm), z).path).tolist() == [-1, -1]
+    assert arm.direction(moved(arm, folding(arm), z).path).tolist() == [-1, -1]
 
 
 def test_its_mirror_image_turns_the_mirrored_way(arm):

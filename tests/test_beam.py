@@ -3,13 +3,12 @@
 import mujoco
 import numpy as np
 import pytest
+from experts import Constant, moved
 from planted import ChartPolicy
 
 import hyrl_mj
 from hyrl_mj import Outcome
 from hyrl_mj.learning.presets import preset
-from hyrl_mj.policies.controllers import PolicyController
-from hyrl_mj.simulation.rollout import LoopSettings, closed_loop
 from hyrl_mj.stages import extend, find_critical_set, make_partition
 
 # Distance from the axis at which the beam is passed [m].
@@ -38,21 +37,6 @@ def passing(task, side=None):
     return ChartPolicy(task, rule)
 
 
-class Constant:
-    """One input for ever."""
-
-    def __init__(self, *u):
-        self.u = u
-
-    def act(self, measured):
-        return np.tile(self.u, (len(measured), 1)).astype(float)
-
-
-def fly(task, policy, z0, steps=None):
-    settings = LoopSettings(steps=steps, quiet=True)
-    return closed_loop(task, PolicyController(policy), np.array(z0), settings=settings)
-
-
 def test_its_clearance_is_that_of_mujoco(beam):
     rng, data = np.random.default_rng(0), mujoco.MjData(beam.model)
     z = rng.uniform(beam.chart.low, beam.chart.high, (300, 3))
@@ -70,14 +54,14 @@ def test_its_clearance_is_that_of_mujoco(beam):
 
 
 def test_it_keeps_its_course(beam):
-    path = fly(beam, Constant(0, 0), [[0.0, 1.0, 2.2]], steps=40).path[:, 0]
+    path = moved(beam, Constant(0, 0), [[0.0, 1.0, 2.2]], steps=40).path[:, 0]
     assert path[-1, 0] == pytest.approx(2 * beam.speed, abs=0.02)
     np.testing.assert_allclose(path[:, 1:], [[1.0, 2.2]] * len(path), atol=2e-3)
 
 
 @pytest.mark.parametrize("u", [(1.2, 0.0), (0.0, 1.2), (0.0, -1.2), (-0.6, 0.6)])
 def test_its_velocity_follows_after_a_while(beam, u):
-    path = fly(beam, Constant(*u), [[0.0, 0.0, 1.6]], steps=18).path[:, 0]
+    path = moved(beam, Constant(*u), [[0.0, 0.0, 1.6]], steps=18).path[:, 0]
     velocity = np.diff(path, axis=0) / beam.dt
     np.testing.assert_allclose(velocity[-1, 1:], u, atol=0.15)
     assert np.abs(velocity[0, 1:]).max() < 0.4 * np.abs(u).max()  # what has inertia does not jump
@@ -85,7 +69,7 @@ def test_its_velocity_follows_after_a_while(beam, u):
 
 def test_every_side_can_be_passed_and_has_its_number(beam):
     for side in range(4):
-        rollout = fly(beam, passing(beam, side), [[0.0, 0.05, 1.58], [0.2, -0.1, 1.7]])
+        rollout = moved(beam, passing(beam, side), [[0.0, 0.05, 1.58], [0.2, -0.1, 1.7]])
         assert (rollout.outcome == Outcome.REACHED).all()
         assert beam.direction(rollout.path).tolist() == [side, side]
     assert tuple(beam.scene.mode_names) == ("left", "above", "right", "below")
@@ -93,27 +77,27 @@ def test_every_side_can_be_passed_and_has_its_number(beam):
 
 def test_beside_the_beam_and_behind_it_nothing_is_left_to_decide(beam):
     z = [[2.2, 0.8, 1.6], [2.5, 0.0, 2.5], [3.5, -0.2, 1.3]]
-    rollout = fly(beam, Constant(0, 0), z)
+    rollout = moved(beam, Constant(0, 0), z)
     assert beam.direction(rollout.path).tolist() == [-1, -1, -1]
 
 
 def test_who_clears_a_corner_of_the_beam_has_nothing_to_decide(beam):
     z = [[0.5, 0.7, 2.3], [0.5, 0.7, 2.2], [0.5, -0.6, 0.9], [0.5, -0.7, 0.9]]
-    rollout = fly(beam, Constant(0, 0), z)
+    rollout = moved(beam, Constant(0, 0), z)
     assert (rollout.outcome == Outcome.REACHED).all()
     assert beam.direction(rollout.path).tolist() == [-1, 0, 3, -1]
 
 
 def test_who_does_not_decide_crashes_and_who_misses_the_gate_does_not_arrive(beam):
     z = [[0.0, 0.0, 1.6], [0.0, 1.25, 1.6], [3.2, 0.3, 1.6]]
-    outcome = fly(beam, Constant(0, 0), z).outcome
+    outcome = moved(beam, Constant(0, 0), z).outcome
     assert outcome.tolist() == [Outcome.CRASHED, Outcome.OUT_OF_BOUNDS, Outcome.REACHED]
 
 
 def test_its_starts_have_time_to_pass_the_beam(beam):
     z = beam.starts(400, np.random.default_rng(0))
     assert beam.may_start(z).all()
-    assert (fly(beam, passing(beam), z).outcome == Outcome.REACHED).all()
+    assert (moved(beam, passing(beam), z).outcome == Outcome.REACHED).all()
     assert not beam.may_start(np.array([[1.7, 0.0, 1.6]])).any()
 
 

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from command_line import call
+from command_line import call, contents
 from gl import needs_gl
 from PIL import Image
 from sentences import assert_has_ended
@@ -41,10 +41,6 @@ def finished(small_runs, tmp_path_factory):
 def copied(finished, tmp_path):
     """A copy of it, to be damaged."""
     return shutil.copytree(finished[0], tmp_path / "run")
-
-
-def contents(path):
-    return {p: p.read_bytes() for p in sorted(path.rglob("*")) if p.is_file()}
 
 
 def assert_one_sentence(process, *parts):

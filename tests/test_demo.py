@@ -21,6 +21,14 @@ COLUMNS = (*CONTROLLERS, "policy_seeds", "hyrl_seeds")
 NUMBERS = ("none", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
 # Finished runs of `scripts/demo`, in whose place new ones are made by default.
 FOLDER = "HYRL_MJ_DEMO_RUNS"
+# The demo, whose figures are blank: no number is read from them, and to lay them out takes long.
+PROGRAM = (
+    "import pytest\n"
+    "from planted import without_pictures\n"
+    "from hyrl_mj import cli\n"
+    "without_pictures(pytest.MonkeyPatch())\n"
+    "cli.main()"
+)
 # How much the shares that the attack finds may differ between processors, in percent of the starts.
 SEARCHED = 0.05
 
@@ -57,8 +65,9 @@ def demo(request, tmp_path_factory):
     if FOLDER in os.environ:
         return request.param, Path(os.environ[FOLDER]) / request.param
     path = tmp_path_factory.mktemp("demo") / request.param
-    command = (sys.executable, "-m", "hyrl_mj.cli", "run", request.param, "--out", path)
-    environment = unmeasured.environment(MUJOCO_GL="disable")  # the video tells no number
+    command = (sys.executable, "-c", PROGRAM, "run", request.param, "--out", path)
+    found = os.pathsep.join((str(ROOT), str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")))
+    environment = unmeasured.environment(MUJOCO_GL="disable", PYTHONPATH=found)  # nor from a video
     subprocess.run(command, cwd=ROOT, stdout=subprocess.DEVNULL, env=environment, check=True)
     return request.param, path
 

@@ -17,6 +17,7 @@ from gl import needs_gl
 from manual import LANGUAGES, PAGES, ROOT, SHORTER, blocks
 from test_algorithms import make_sac_run
 from test_robustify import make_robust
+from test_sensors import make_late
 from test_sweep import make_sweep
 
 import hyrl_mj
@@ -165,6 +166,8 @@ def answers(small_runs, made_once, tmp_path_factory):
     shutil.copytree(sweep, folder / "sweeps" / "runs" / "circle_seeds")
     sac = made_once("circle_sac", make_sac_run) / "run"
     shutil.copytree(sac, folder / "algorithms" / "runs" / "circle_sac")
+    late = made_once("late", make_late) / "run"
+    shutil.copytree(late, folder / "sensors" / "runs" / "vehicle_late")
     robust = made_once("robust", make_robust)
     shutil.copytree(robust / "run", folder / "your-agent" / "runs" / "vehicle_robust")
     shutil.copy(robust / "agent.zip", folder / "your-agent" / "made.zip")

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from command_line import contents
 from planted import circle_policy, decisions, halves
 from test_report import plant
 
@@ -27,10 +28,6 @@ NAMES = [*STAGES]
 def run(planted_circle, tmp_path):
     """A copy of the planted run, to be changed."""
     return hyrl_mj.load_run(shutil.copytree(planted_circle[0].path, tmp_path / "run"))
-
-
-def contents(path):
-    return {p.relative_to(path): p.read_bytes() for p in sorted(path.rglob("*")) if p.is_file()}
 
 
 def stages_done(run):
@@ -54,7 +51,7 @@ def test_a_run_goes_on_where_it_was_left(planted_circle):
 def test_what_the_stages_leave(planted_circle):
     run, _ = planted_circle
     arcs = {f"arcs/{s}_{who}.npz" for s, who in run.arcs()}
-    left = {str(name) for name in contents(run.path)}
+    left = {str(path.relative_to(run.path)) for path in contents(run.path)}
     assert arcs <= left
     assert {"robustness.json", "robustness.npz", "figures/overview.pdf", "report.html"} <= left
     assert not [name for name in left if "partial" in name or name.startswith("replay")]

@@ -2,13 +2,11 @@
 
 import numpy as np
 import pytest
-from experts import Expert
+from experts import Constant, moved
 
 import hyrl_mj
 from hyrl_mj import Outcome
-from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.sets import Grid
-from hyrl_mj.simulation.rollout import LoopSettings, closed_loop
 from hyrl_mj.stages.partition import longest_hop
 from hyrl_mj.tasks.flight import rotation
 
@@ -16,22 +14,6 @@ from hyrl_mj.tasks.flight import rotation
 @pytest.fixture(scope="module")
 def quadrotor():
     return hyrl_mj.get_task("quadrotor")
-
-
-class Constant:
-    """One input for ever."""
-
-    def __init__(self, u):
-        self.u = u
-
-    def act(self, measured):
-        return np.full((len(measured), 1), self.u)
-
-
-def fly(task, policy, z0, steps=None):
-    return closed_loop(
-        task, PolicyController(policy), np.array(z0), settings=LoopSettings(steps=steps, quiet=True)
-    )
 
 
 def test_a_rotation_is_that_of_mujoco(quadrotor):
@@ -58,7 +40,7 @@ def test_it_keeps_speed_and_height(quadrotor):
 
 @pytest.mark.parametrize("u", [-1.0, -0.5, 1.0])
 def test_its_lateral_velocity_follows_after_a_while(quadrotor, u):
-    path = fly(quadrotor, Constant(u), [[0.0, -u / 2, 0.0]], steps=20).path[:, 0, 1]
+    path = moved(quadrotor, Constant(u), [[0.0, -u / 2, 0.0]], steps=20).path[:, 0, 1]
     velocity = np.diff(path) / 0.05
     assert abs(velocity[0]) < 0.2 * abs(u)
     assert velocity[-1] == pytest.approx(u, rel=0.15)
@@ -104,26 +86,6 @@ def test_its_mixer_gives_the_torques_that_are_asked_for(quadrotor):
     np.testing.assert_allclose([thrust.sum(), *torque[:2], twist], wanted, atol=1e-12)
 
 
-def test_its_mirror_image_flies_the_mirrored_way(quadrotor):
-    z = quadrotor.starts(20, np.random.default_rng(0))
-    runs = [fly(quadrotor, Constant(u), z * [1, s, s], 15) for u, s in ((0.9, 1), (-0.9, -1))]
-    np.testing.assert_allclose(runs[0].path, runs[1].path * [1, -1, -1], atol=1e-6)
-
-
-def test_who_decides_late_crashes(quadrotor):
-    starts = [[x, 0.0, 0.0] for x in (0.0, 0.3, 1.7)]
-    for side in (1, -1):
-        outcome = fly(quadrotor, Expert(quadrotor, side), starts).outcome
-        assert outcome.tolist() == [Outcome.REACHED, Outcome.REACHED, Outcome.CRASHED]
-
-
-@pytest.mark.slow
-def test_an_expert_survives_from_every_start(quadrotor):
-    z = quadrotor.starts(300, np.random.default_rng(0))
-    won = [fly(quadrotor, Expert(quadrotor, s), z).outcome == Outcome.REACHED for s in (1, -1)]
-    assert np.any(won, axis=0).all()
-
-
 @pytest.fixture(scope="module")
 def around_the_pillar(quadrotor):
     """One sample from starts all around the pillar, that touch it or do not."""
@@ -131,7 +93,7 @@ def around_the_pillar(quadrotor):
     drift = np.resize([-1.2, -0.4, 0.4, 1.2], x.size)
     z0 = np.stack([x.ravel(), y.ravel(), drift], axis=1)
     begun = quadrotor.clearance(quadrotor.with_z(np.zeros((len(z0), 5)), z0)) <= 0
-    return fly(quadrotor, Constant(0.0), z0[~begun], steps=1)
+    return moved(quadrotor, Constant(0.0), z0[~begun], steps=1)
 
 
 def test_a_collision_is_seen_at_the_next_sample(around_the_pillar):

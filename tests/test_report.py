@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser import chromium, needs_chromium
+from command_line import contents
 from PIL import Image
 from planted import Cube, believe, decisions, halves, without_pdfs
 
@@ -458,10 +459,6 @@ def test_in_three_dimensions_the_game_is_an_estimate_beside_the_episodes(
 
 
 # ---- what goes wrong
-
-
-def contents(path):
-    return {p: p.read_bytes() for p in sorted(path.rglob("*")) if p.is_file()}
 
 
 @pytest.mark.parametrize("name", ["mode_0.safetensors", "critical_set.npz", "partition.npz"])

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import call
+from command_line import call, contents
 from gl import needs_gl
 from planted import circle_policy
 from sentences import assert_has_ended
@@ -39,10 +39,6 @@ from hyrl_mj.stages.retraining import retrain, start_policy
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("small_runs")]  # whole runs on agents
 
 SMOKE = {"preset": "smoke", "say": str}
-
-
-def contents(path):
-    return {p: p.read_bytes() for p in sorted(path.rglob("*")) if p.is_file()}
 
 
 def away(observation):

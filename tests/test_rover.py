@@ -3,34 +3,16 @@
 import mujoco
 import numpy as np
 import pytest
-from experts import Expert
+from experts import Constant, moved
 
 import hyrl_mj
 from hyrl_mj import Outcome
-from hyrl_mj.policies.controllers import PolicyController
-from hyrl_mj.simulation.rollout import LoopSettings, closed_loop
 from hyrl_mj.tasks.trial import try_control
 
 
 @pytest.fixture(scope="module")
 def rover():
     return hyrl_mj.get_task("rover")
-
-
-class Constant:
-    """One input for ever."""
-
-    def __init__(self, u):
-        self.u = u
-
-    def act(self, measured):
-        return np.full((len(measured), 1), self.u)
-
-
-def drive(task, policy, z0, steps=None):
-    return closed_loop(
-        task, PolicyController(policy), np.array(z0), settings=LoopSettings(steps=steps, quiet=True)
-    )
 
 
 def test_it_stands_on_two_wheels_and_a_caster(rover):
@@ -72,28 +54,21 @@ def test_wheels_that_depend_on_the_state_are_asked_at_every_step(rover):
 
 
 def test_it_drives_straight_at_its_speed(rover):
-    path = drive(rover, Constant(0.0), [[0.0, 1.0, 0.0]], steps=40).path[:, 0]
+    path = moved(rover, Constant(0.0), [[0.0, 1.0, 0.0]], steps=40).path[:, 0]
     assert path[-1, 0] == pytest.approx(2.0, abs=0.1)
     np.testing.assert_allclose(path[:, 1:], [[1.0, 0.0]] * len(path), atol=5e-3)
 
 
 @pytest.mark.parametrize("u", [-1.2, -0.6, 0.6, 1.2])
 def test_it_turns_at_the_rate_that_is_asked_for(rover, u):
-    heading = drive(rover, Constant(u), [[0.0, 0.0, 0.0]], steps=10).path[:, 0, 2]
+    heading = moved(rover, Constant(u), [[0.0, 0.0, 0.0]], steps=10).path[:, 0, 2]
     assert (heading[10] - heading[4]) / 0.3 == pytest.approx(u, rel=0.15)
     # It takes a while: what has inertia does not jump.
     assert abs(heading[1]) < 0.8 * abs(u) * 0.05
 
 
-def test_its_mirror_image_drives_the_mirrored_way(rover):
-    rng = np.random.default_rng(0)
-    z = rover.starts(20, rng)
-    runs = [drive(rover, Constant(u), z * [1, s, s], 15) for u, s in ((1.1, 1), (-1.1, -1))]
-    np.testing.assert_allclose(runs[0].path, runs[1].path * [1, -1, -1], atol=1e-4)
-
-
 def test_what_touches_the_pillar_has_crashed(rover):
-    rollout = drive(rover, Constant(0.0), [[0.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    rollout = moved(rover, Constant(0.0), [[0.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     assert rollout.outcome.tolist() == [Outcome.CRASHED, Outcome.REACHED]
     plant = rover.plant(1)
     plant.set_state(*rover.state(np.array([[1.5, 0.0, 0.0]])))
@@ -101,20 +76,6 @@ def test_what_touches_the_pillar_has_crashed(rover):
         plant.step(np.zeros((1, 1)))
     x = plant.measurement[0, 0]
     assert x == pytest.approx(2.3 - 0.45 - 0.16 + 0.035, abs=0.06)
-
-
-def test_who_decides_late_crashes(rover):
-    starts = [[x, 0.0, 0.0] for x in (0.0, 0.3, 1.4)]
-    for side in (1, -1):
-        outcome = drive(rover, Expert(rover, side), starts).outcome
-        assert outcome.tolist() == [Outcome.REACHED, Outcome.REACHED, Outcome.CRASHED]
-
-
-@pytest.mark.slow
-def test_an_expert_survives_from_every_start(rover):
-    z = rover.starts(300, np.random.default_rng(0))
-    survived = [drive(rover, Expert(rover, s), z).outcome == Outcome.REACHED for s in (1, -1)]
-    assert np.any(survived, axis=0).all()
 
 
 def test_its_start_states_move_at_the_speed_of_its_wheels(rover):

@@ -3,15 +3,8 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from planted import (
-    ChartPolicy,
-    Cube,
-    homing_controller,
-    homing_policy,
-    ideal_controller,
-    random_states,
-    sign_policy,
-)
+from figure_parts import controller_of, policy_of
+from planted import ChartPolicy, Cube, homing_controller, ideal_controller, random_states
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from hyrl_mj import BadInput, LoopSettings, Noise, closed_loop
@@ -22,14 +15,6 @@ from hyrl_mj.gym_export.sb3_policy import Sb3Policy
 from hyrl_mj.policies.controllers import as_controller
 
 QUIET, ALTERNATING, UNIFORM = Noise(), Noise("alternating", 0.1), Noise("uniform", 0.1)
-
-
-def controller_of(task):
-    return homing_controller(task) if task.name == "unit_circle" else ideal_controller(task)
-
-
-def policy_of(task):
-    return homing_policy(task) if task.name == "unit_circle" else sign_policy(task)
 
 
 LOOPS = {"hyrl": controller_of, "policy": policy_of}

@@ -10,7 +10,6 @@ import pytest
 from environments import Puck
 from hypothesis import given, settings, strategies as st
 from manual import ROOT
-from planted import TINY
 
 import hyrl_mj
 from hyrl_mj import BadInput, Noise, RunOptions, Sensor, cli
@@ -358,14 +357,17 @@ def test_what_is_no_log_of_a_task_is_refused(log, tmp_path):
 # ---- runs
 
 
-@pytest.fixture(scope="module")
-def late(small_runs, tmp_path_factory):
-    """A small run that is made for a sensor."""
-    out = tmp_path_factory.mktemp("late") / "run"
+def make_late(folder):
+    """Makes the run of the manual's page about sensors."""
     text = "uniform 0.05 + bias 0.05 + delay 1"
-    return hyrl_mj.run(
-        VEHICLE, noise=text, preset="smoke", set=TINY, out=out, say=lambda text: None
-    )
+    hyrl_mj.run(VEHICLE, noise=text, preset="smoke", out=folder / "run", say=str)
+
+
+@pytest.fixture(scope="module")
+def late(small_runs, made_once, tmp_path_factory):
+    """A run that is made for a sensor, which these tests examine again."""
+    made = made_once("late", make_late) / "run"
+    return hyrl_mj.load_run(shutil.copytree(made, tmp_path_factory.mktemp("late") / "run"))
 
 
 @pytest.mark.slow

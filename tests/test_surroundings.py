@@ -12,6 +12,7 @@ import termios
 from pathlib import Path
 
 import pytest
+from command_line import call
 from gl import needs_gl
 from planted import FEW_CELLS
 
@@ -132,8 +133,9 @@ def test_a_terminal_that_knows_few_characters_gets_others_also_without_gl(folder
 
 
 @pytest.mark.parametrize("columns", ["1", "many", "100000"])
-def test_every_width_can_be_read(columns):
-    done = shell("$HYRL run --help", COLUMNS=columns)
+def test_every_width_can_be_read(columns, monkeypatch):
+    monkeypatch.setenv("COLUMNS", columns)
+    done = call("run", "--help")
     assert done.returncode == 0, done.stderr
     assert "--preset" in done.stdout
     assert max(map(len, done.stdout.splitlines())) >= 50
