@@ -162,10 +162,16 @@ class EnvironmentPlant:
         """
         rows, nq, nv = self._rows(ids), len(self.spec.qpos), len(self.spec.qvel)
         qvel = np.zeros((len(rows), nv)) if qvel is None else qvel
+        state = np.tile(self.spec.state, (len(rows), 1))
+        state[:, self.spec.qpos] = checked("qpos", qpos, nq, rows)
+        state[:, self.spec.qvel] = checked("qvel", qvel, nv, rows)
+        self.resume(state, rows)
+
+    def resume(self, state: np.ndarray, ids: np.ndarray | None = None) -> None:
+        """Begins the runs `ids` (k,), all by default, in whole states (k, nstate) as `state` gives them."""
+        rows = self._rows(ids)
         self._leave(rows)
-        self._state[rows] = self.spec.state
-        self._state[np.ix_(rows, self.spec.qpos)] = checked("qpos", qpos, nq, rows)
-        self._state[np.ix_(rows, self.spec.qvel)] = checked("qvel", qvel, nv, rows)
+        self._state[rows] = state
         self._unstable[rows], self._open[rows] = False, True
         seen, depths = self._pool.scatter("rest", self._state[rows])
         blocked = depths > self.spec.depth

@@ -177,10 +177,15 @@ class Plant:
 
     def put(self, state: np.ndarray) -> None:
         """Sets the whole state of all copies (n, nstate), as `state` gives it, and updates their sensors."""
+        self.resume(state)
+
+    def resume(self, state: np.ndarray, ids: np.ndarray | None = None) -> None:
+        """Lets the copies `ids` (k,), all by default, go on from whole states (k, nstate)."""
         self._wake()
-        self._batch.state[:] = state
-        self._unstable[:] = False
-        self._sense(None)
+        rows = self._rows(ids)
+        self._batch.state[rows] = state
+        self._unstable[rows] = False
+        self._sense(ids)
 
     def geom_positions(self, ids: Sequence[int]) -> np.ndarray:
         """Returns the positions of geoms in the world: (n, k, 3) [m], or (1, k, 3) if none of them moves."""

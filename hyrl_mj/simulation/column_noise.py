@@ -23,6 +23,8 @@ UNITS = {
     for a, b, factor in ((a, b, x), (b, a, 1 / x))
 }
 
+ANYWHERE = np.pi / np.sqrt(3)  # the standard deviation of an angle that may be any [rad]
+
 
 @dataclass(frozen=True)
 class ColumnNoise:
@@ -139,6 +141,11 @@ def column_noise(
         if used.sum() < LEAST:
             why = f"{name} has fewer than {LEAST} samples with a reference that are not held"
             return ColumnNoise(name, remarks=(why,))
+        if turn and np.std(raw[used]) > ANYWHERE / 2:
+            raise BadInput(
+                f"{name} errs by up to {np.abs(raw[used]).max():.3g} rad, all around the circle: if it is in "
+                f"degrees, give --scale {name}=0.0174533 {name}_ref=0.0174533"
+            )
         kept = np.clip(raw, *np.quantile(raw[used], [(1 - share) / 2, (1 + share) / 2]))
         slow, drift, rate, unsure = _drift(np.where(used, kept, nan), dt, tiny)
         left = raw - slow
@@ -241,8 +248,7 @@ def _check_units(name: str, y: np.ndarray, r: np.ndarray) -> None:
 def _check_turns(name: str, error: np.ndarray) -> None:
     """Raises `BadInput` if errors (n,) jump by whole turns, as those of an angle do."""
     error = error[np.isfinite(error)]
-    anywhere = np.pi / np.sqrt(3)  # deviation of an angle that may be any
-    if len(error) and np.std(wrapped(error)) < min(np.std(error), anywhere) / 2:
+    if len(error) and np.std(wrapped(error)) < min(np.std(error), ANYWHERE) / 2:
         raise BadInput(
             f"{name} differs from {name}_ref by up to {np.abs(error).max():.3g}, and by far less up to whole "
             f"turns: if it is an angle in rad, give --turn {name}"

@@ -27,7 +27,7 @@ class Ahead(Rows):
 
     Attributes:
         danger: (k, samples) the danger after each sample; -inf after the end of a simulation.
-        state: (k, nq + nv) the state after the last sample.
+        state: (k, nstate) MuJoCo's whole state after the last sample.
         answers: (k, m + 1) the controller's inputs and mode in that state.
         goes_on: (k,) bool, whether the simulation has not ended.
     """
@@ -200,7 +200,7 @@ class Lookahead(Signal):
             answers: (c, m + 1) the controller's answers to them, inputs and mode.
             memory: (c, ...) its memory after these answers.
         """
-        state = np.hstack([plant.qpos[rows], plant.qvel[rows]])
+        state = plant.state[rows]
         danger = np.full((len(rows), self.samples), -np.inf)
         runs = Ahead(danger, state, answers, np.ones(len(rows), dtype=bool))
         known = (candidate == 0) & (self._kept_at[rows] == k - 1)
@@ -251,12 +251,11 @@ class Lookahead(Signal):
             u, q, memory = answer_of(self.controller, *before)
             answers = np.column_stack([u, q])
         next_answers[rows] = answers[: len(rows)]
-        end = np.hstack([plant.qpos, plant.qvel])[: len(danger)]
+        end = plant.state[: len(danger)]
         return Ahead(danger, end, next_answers, np.isin(np.arange(len(danger)), rows))
 
     def _placed(self, state: np.ndarray) -> Plant:
-        """Returns copies of the robot, the first k of them in states (k, nq + nv)."""
+        """Returns copies of the robot, the first k of them in whole states (k, nstate) of MuJoCo."""
         self._copies = self._copies or self.task.plant(BATCH)
-        nq = self._copies.model.nq
-        self._copies.set_state(state[:, :nq], state[:, nq:], np.arange(len(state)))
+        self._copies.resume(state, np.arange(len(state)))
         return self._copies

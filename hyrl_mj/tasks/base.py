@@ -275,8 +275,8 @@ class Task(ABC):
 
     def at(self, z: np.ndarray) -> np.ndarray:
         """Returns the measurements (n, p) of a robot at chart points z (n, d), without noise."""
-        if self.measurement_columns == self.chart.dimension:
-            return z
+        if self.measurement_columns == self.chart.dimension:  # nothing else is measured
+            return self.with_z(z, z)
         return self.placed(z).measurement
 
     def with_z(self, measured: np.ndarray, z: np.ndarray) -> np.ndarray:
@@ -356,10 +356,11 @@ class Task(ABC):
         return rng.uniform(self.start_low, self.start_high, (n, self.chart.dimension))
 
     def may_start(self, z: np.ndarray) -> np.ndarray:
-        """Returns (n,) bool: whether chart points (n, d) lie in the box of starts."""
-        z, slack = self.chart.wrap(z), 1e-9
-        inside = (z >= np.subtract(self.start_low, slack)) & (z <= np.add(self.start_high, slack))
-        return np.asarray(inside.all(axis=1))
+        """Returns (n,) bool: whether chart points (n, d) lie in the box of starts, or whole turns off it."""
+        low, high, slack = np.array(self.start_low), np.array(self.start_high), 1e-9
+        middle = (low + high) / 2
+        off = np.abs(self.chart.difference(z, middle))
+        return np.asarray((off <= (high - low) / 2 + slack).all(axis=1))
 
     # ---- what tells it from others, and its noise
 

@@ -257,13 +257,17 @@ def _check_noise_of_chart(task: Task, measurement: np.ndarray) -> None:
     if type(task).z is Task.z:
         return
     z, step, shares = task.z(measurement), 1e-6, np.array(task.noisy, dtype=float)
-    by = sum(
-        np.abs(task.chart.difference(task.z(measurement + column), z))
-        for column in step * np.diag(shares)
+    by = np.array(
+        [
+            np.abs(task.chart.difference(task.z(measurement + column), z)) / step
+            for column in step * np.diag(shares)
+        ]
     )
-    moved, said = np.max(by, axis=0) / step, shares[: task.chart.dimension]
-    # Cosine and sine together move their angle by 1.4 times their share of the noise.
-    apart = 2.0
+    moved, said = by.sum(axis=0).max(axis=0), shares[: task.chart.dimension]
+    # Cosine and sine together move their angle by the root of 2 times their share of the noise. What another
+    # column moves alone has to be moved as far as is said.
+    own = np.array([by[i, :, i].any() for i in range(len(said))])
+    apart = np.where(own, np.sqrt(2) + 1e-3, 1.0)
     wrong = (moved > apart * said + 1e-6) | (moved * apart < said - 1e-6)
     if wrong.any():
         i = int(wrong.argmax())

@@ -175,13 +175,18 @@ def try_place(task: Task) -> None:
     rng = np.random.default_rng(0)
     z = task.chart.draw(STARTS, rng)
     where, number = mjcf.point_of(model, tracked)
-    data, places = mujoco.MjData(model), []
+    moves = np.flatnonzero(model.body_weldid[model.geom_bodyid] != 0)
+    data, places, reach = mujoco.MjData(model), [], 0.0
     for qpos in task.state(z, rng)[0]:
         mjcf.place(model, data, qpos, task.mocap)
-        places.append(getattr(data, where)[number][list(task.plane)].copy())
+        place = getattr(data, where)[number]
+        places.append(place[list(task.plane)].copy())
+        far = np.linalg.norm(data.geom_xpos[moves] - place, axis=1) + model.geom_rbound[moves]
+        reach = max(reach, float(far.max(initial=0.0)))
     moved = np.ptp(places, axis=0)
-    apart = np.ptp(task.where(task.placed(z).measurement) - places, axis=0)
-    if (apart > moved / 2).any():  # a point may be off the middle of a robot that turns
+    off = task.where(task.placed(z).measurement) - places
+    # A point may be off the middle of a robot that turns, but not off the robot.
+    if (np.ptp(off, axis=0) > moved / 2).any() or np.abs(off).max() > (reach or np.inf):
         names = " and ".join(task.chart.names[:2])
         raise BadInput(
             f"its chart begins with {names}, and these are not the place of {tracked} in the plane "

@@ -68,8 +68,13 @@ class Game:
 
     @cached_property
     def starts(self) -> np.ndarray:
-        """(N,) bool, the nodes of the start region."""
-        return self.task.may_start(self.lattice.grid.nodes) & self.lattice.running
+        """(N,) bool, the nodes of the start region; where it lies between nodes, those next to starts."""
+        grid, running = self.lattice.grid, self.lattice.running
+        nodes = self.task.may_start(grid.nodes) & running
+        if not nodes.any():
+            drawn = self.task.starts(1_000, np.random.default_rng(0))
+            nodes[grid.nearest(drawn)] = True
+        return nodes & running
 
     def moves(self, name: str, eps: float) -> Moves:
         """Returns the adversary's moves against a controller, or against the limit."""
