@@ -79,11 +79,15 @@ def _drawn(instance: Instance, states: np.ndarray) -> list[str]:
     for kind, bodies in (("qpos", body_of_qpos), ("qvel", model.dof_bodyid)):
         varies[columns[kind][robot[bodies]]] = False
     names = [name for name, v in zip(_names_of_state(instance), varies, strict=True) if v]
-    # Nothing has outlasted the first reset of a new instance.
-    begun = [_begun(Instance(instance.spec), states[:3], seed) for seed in range(COMPARED)]
+    again = [_begun(instance, states[:1], 0)[0] for _ in range(2)]
+    lasting = set(differing(*again))  # what outlasts a reset is not drawn by it
+    begun = [
+        _begun(Instance(instance.spec) if lasting else instance, states[:3], seed)
+        for seed in range(COMPARED)
+    ]
+    if lasting:  # nothing has outlasted the first reset of a new instance
+        lasting = set(differing(begun[0][0], _begun(Instance(instance.spec), states[:1], 0)[0]))
     first, told = begun[0]
-    again, _ = _begun(Instance(instance.spec), states[:1], 0)
-    lasting = set(differing(first, again))  # what differs by itself is not drawn
     changed = dict.fromkeys(n for other, _ in begun[1:] for n in differing(first, other))
     of_model = [n for n in changed if n.endswith(" of its model") and n not in lasting]
     passed = {*lasting, *of_model, *(n for found, _ in begun for n in found.generators)}
