@@ -13,8 +13,6 @@ from hyrl_mj.gym_import.instance import Instance
 
 # Resets that are compared for all that they draw.
 COMPARED = 4
-# What `Instance.remembered` calls the state, of which `names_of_state` tells more.
-STATE = "MuJoCo's state"
 
 
 def states_of_resets(instance: Instance) -> np.ndarray:
@@ -81,14 +79,18 @@ def _drawn(instance: Instance, states: np.ndarray) -> list[str]:
     for kind, bodies in (("qpos", body_of_qpos), ("qvel", model.dof_bodyid)):
         varies[columns[kind][robot[bodies]]] = False
     names = [name for name, v in zip(_names_of_state(instance), varies, strict=True) if v]
-    # Nothing has outlasted the first reset of a new instance.
-    begun = [_begun(Instance(instance.spec), states[:3], seed) for seed in range(COMPARED)]
+    again = [_begun(instance, states[:1], 0)[0] for _ in range(2)]
+    lasting = set(differing(*again))  # what outlasts a reset is not drawn by it
+    begun = [
+        _begun(Instance(instance.spec) if lasting else instance, states[:3], seed)
+        for seed in range(COMPARED)
+    ]
+    if lasting:  # nothing has outlasted the first reset of a new instance
+        lasting = set(differing(begun[0][0], _begun(Instance(instance.spec), states[:1], 0)[0]))
     first, told = begun[0]
-    again, _ = _begun(Instance(instance.spec), states[:1], 0)
-    lasting = set(differing(first, again))  # what differs by itself is not drawn
     changed = dict.fromkeys(n for other, _ in begun[1:] for n in differing(first, other))
     of_model = [n for n in changed if n.endswith(" of its model") and n not in lasting]
-    passed = {*lasting, *of_model, STATE, *(n for found, _ in begun for n in found.generators)}
+    passed = {*lasting, *of_model, *(n for found, _ in begun for n in found.generators)}
     differ = [name for name in changed if name not in passed and "_seed" not in name]
     sizes = np.abs(told[np.isfinite(told)])
     most = 1e-9 * max(float(sizes.max(initial=0.0)), 1.0)
@@ -111,7 +113,7 @@ def _begun(instance: Instance, starts: np.ndarray, seed: int) -> tuple[Fingerpri
     remembered, told, rng = None, [], np.random.default_rng(0)
     for start in starts:
         seen = instance.put(start, seed)
-        remembered = remembered or instance.remembered()
+        remembered = remembered or instance.memory()
         told.append(seen)
         for result in instance.wander(rng, samples=100, held=10):
             instance.take(result)
@@ -132,11 +134,11 @@ def _changed_by_user(instance: Instance) -> set[str]:
         seen = []
         for plain in (False, True):
             instance.reset(seed, plain)
-            seen.append(remembered := instance.remembered())
+            seen.append(remembered := instance.memory())
             state = instance.physics.read().tolist()
             remembered.update(zip(_names_of_state(instance), state, strict=True))
         found.update(differing(*seen))
-    return found - {STATE}
+    return found
 
 
 def _check_pins(instance: Instance) -> None:

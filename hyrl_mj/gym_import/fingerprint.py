@@ -221,7 +221,7 @@ def _parts(value: Any, path: str, found: Fingerprint, depth: int) -> dict[str, A
         return {}
     state = object.__getstate__(value)  # with what a class keeps outside of `__dict__`, if it does
     slots = state[1] if isinstance(state, tuple) else {}
-    # Arguments of a constructor, and methods that are put in by `Chain`.
+    # Arguments of a constructor, and methods that are put in by `Instance`.
     passed = "_ezpickle_args", "_ezpickle_kwargs", "_saved_kwargs", "step", "reset"
     left_out = passed if depth == 0 else ()
     own = {name: part for name, part in vars(value).items() if name not in left_out}

@@ -291,9 +291,8 @@ class Instance:
         self._own_step, self._own_reset = inner.step, inner.reset
         self._resetting = False  # its own reset may step it
         self._calls = 0  # of the step, in a sample
-        self._shown: np.ndarray | None = (
-            None  # the state that wrappers see, if it is not the true one
-        )
+        # The state that wrappers see, if it is not the true one.
+        self._shown: np.ndarray | None = None
         try:
             inner.step, inner.reset = self._inner_step, self._inner_reset
         except Exception as error:

@@ -211,8 +211,8 @@ def _check_received(env: str, given: Mapping[str, Any], spec: str) -> None:
     else:
         register(env)
         known = env in gym.registry
-    plain = _is_plain([given.get("kwargs"), given.get("reset")])
-    if not known or not (plain or trust.is_known_text(_recorded(spec, given))):
+    recorded = _recorded(spec, given)
+    if not known or not (recorded == spec or trust.is_known_text(recorded)):
         args = {name: value for name, value in given.items() if name != "env"}
         how = f"--env {shlex.quote(env)}"
         if args:

@@ -285,8 +285,6 @@ def checked_step(result: Any, name: str) -> tuple[Any, float, Any, Any, dict[str
             "terminated, truncated and info"
         )
     observation, reward, terminated, truncated, info = result
-    if isinstance(reward, float) and isinstance(info, dict):  # NumPy's, too
-        return observation, float(reward), terminated, truncated, info
     number = np.asarray(reward)
     if number.size != 1 or number.dtype.kind not in "biuf" or not isinstance(info, dict):
         raise BadInput(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -81,14 +81,19 @@ def check_use(spec: EnvironmentSpec) -> None:
     over the chart. What the latter gives has to be returned, and both runs have to go the same way. Wrappers
     give the actions of a run without noise.
     """
-    inner = Instance(spec).inner
+    wrapped = Instance(spec)
+    inner, step = wrapped.inner, wrapped.inner.step
     if not hasattr(type(inner), spec.observer) or spec.observer in getattr(
         inner, "__dict__", {spec.observer: None}
     ):  # it is made of several methods, or put in already, or the environment allows no attributes
         return
-    wrapped, true, noisy = Instance(spec), _Sensor(spec), _Sensor(spec)
-    actions: list[Any] = []
-    wrapped.inner.step = _noting(wrapped.inner.step, actions)
+    true, noisy, actions = _Sensor(spec), _Sensor(spec), list[Any]()
+
+    def noting(action: Any) -> Any:
+        actions.append(copy.copy(action))
+        return step(action)
+
+    inner.step = noting
     rng, half = np.random.default_rng(10), spec.chart.sides * (np.array(spec.noisy) > 0) / 2
     for state in spec.state_at(spec.anywhere(rng, EPISODES)):
         wrapped.reset()
@@ -121,16 +126,6 @@ def check_use(spec: EnvironmentSpec) -> None:
                 )
             if ended or any([*result[2:4], *other[2:4]]):
                 break
-
-
-def _noting(step: Callable[[Any], Any], actions: list[Any]) -> Callable[[Any], Any]:
-    """Returns the step of an environment, which also notes its actions."""
-
-    def noting(action: Any) -> Any:
-        actions.append(copy.copy(action))
-        return step(action)
-
-    return noting
 
 
 def _holds(given: list[np.ndarray], seen: np.ndarray) -> bool:
@@ -296,8 +291,9 @@ def _run(
 
     def tamper(rest: tuple[Any, ...]) -> tuple[Any, ...]:
         new = {} if changes is None else changes[len(told)]
-        told.append(_told(instance.inner, rest[-1]))
         info = dict(rest[-1])
+        held = _held(instance.inner, info)
+        told.append({name: copy.deepcopy(owner[key]) for name, owner, key in held})
         for name, owner, key in [*_held(instance.inner, info)] if new else ():
             if name in new:
                 owner[key] = copy.deepcopy(new[name])
@@ -311,13 +307,8 @@ def _run(
     return found
 
 
-def _told(inner: Any, info: Any) -> Told:
-    """Returns the numbers in `info` and in attributes of an environment, also within objects, by name."""
-    return {name: copy.deepcopy(owner[key]) for name, owner, key in _held(inner, dict(info))}
-
-
 def _held(inner: Any, info: dict[str, Any]) -> Iterator[tuple[str, Any, Any]]:
-    """Yields the name, the owner and the key of all numbers that an environment tells beside observing."""
+    """Yields name, owner and key of all numbers in `info` and in attributes, also within objects."""
     seen = {id(inner)}
     for kind, owner in (("info", info), ("attribute", getattr(inner, "__dict__", {}))):
         yield from _within(owner, f"{kind} ", seen, 0)
