@@ -16,7 +16,7 @@ from hyrl_mj.stages.partition import (
     part_policy,
     with_room,
 )
-from hyrl_mj.stages.tables import BoundTable, HeldInputs, TableOf, TablePolicy, table_for
+from hyrl_mj.stages.tables import BoundTable, HeldInputs, TablePolicy, table_for
 
 __all__ = [
     "BoundTable",
@@ -25,7 +25,6 @@ __all__ = [
     "HeldInputs",
     "PartPolicy",
     "Partition",
-    "TableOf",
     "TablePolicy",
     "all_part_policies",
     "boundary",
