@@ -114,7 +114,7 @@ def retrain_stage(run: Run, say: Say) -> None:
     algorithms.check_named(s.stage6.algorithm)
     held = HeldInputs.from_sets(task, sets, s.table) if task.effort.attacked else None
     work = partial(
-        _retrained, task, s, sets, run.split, run.partition, run.steady, held, run.path / "logs"
+        _retrained, task, s, sets, run.steady, run.partition, run.split, held, run.path / "logs"
     )
     done: list[tuple[ModePolicy, ModeResult]] = []
     if task.mirror is None:
@@ -133,9 +133,9 @@ def _retrained(
     task: Task,
     settings: Settings,
     sets: ExtendedSets,
-    split: Partition,
-    partition: Partition,
     policy: Policy,
+    partition: Partition,
+    split: Partition,
     held: HeldInputs | None,
     logs: Path,
     mode: int,
