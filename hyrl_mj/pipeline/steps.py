@@ -25,15 +25,14 @@ from hyrl_mj.judging import (
 from hyrl_mj.judging.game import Lattice, Limit, Robustness
 from hyrl_mj.learning import Settings
 from hyrl_mj.physics import mujoco_log
-from hyrl_mj.policies import Agent, Controller, PolicyController, algorithms
+from hyrl_mj.policies import Agent, Controller, Policy, PolicyController, algorithms
 from hyrl_mj.runs.arcs import replay_arcs
 from hyrl_mj.runs.diagnosis import losses_of, sentences, usual_arc, worst_arc
 from hyrl_mj.runs.directory import Run
 from hyrl_mj.stages import (
+    ExtendedSets,
     HeldInputs,
     Partition,
-    PartPolicy,
-    TableOf,
     boundary,
     extend,
     find_critical_set,
@@ -44,12 +43,11 @@ from hyrl_mj.stages import (
 )
 from hyrl_mj.system import cores
 from hyrl_mj.system.progress import Say
-from hyrl_mj.tasks import SPARING
+from hyrl_mj.tasks import SPARING, Task
 from hyrl_mj.viz import ReplayOptions, replay_sentence, robustness_sentence
 
 if TYPE_CHECKING:
-    from hyrl_mj.stages.grounds import ModeGround
-    from hyrl_mj.stages.retraining import ModePolicy, WarmStart
+    from hyrl_mj.stages.retraining import ModePolicy
 
 # The video with preset smoke only shows that a video can be made.
 SMOKE = ReplayOptions(size=(640, 360), fps=10)
@@ -112,30 +110,14 @@ def extended_sets_stage(run: Run, say: Say) -> None:
 
 def retrain_stage(run: Run, say: Say) -> None:
     """Stage 6: trains the policy of each mode."""
-    from hyrl_mj.stages.grounds import mode_ground
-    from hyrl_mj.stages.retraining import start_policy
-
-    s, sets = run.settings, run.extended_sets
+    s, sets, task = run.settings, run.extended_sets, run.task
     algorithms.check_named(s.stage6.algorithm)
-    warm_start = partial(start_policy, run.steady, run.partition)
-    part_of = partial(part_policy, run.task, run.steady, run.partition, eps=sets.eps)
-    parts, table_of = None, None
-    if run.task.effort.attacked:
-        parts, held = part_of, HeldInputs.from_sets(run.task, sets, s.table)
-        table_of = None if held is None else partial(table_for, held)
-    ground_of = partial(
-        mode_ground,
-        run.task,
-        sets,
-        parts=run.split,
-        policy=run.steady,
-        table=table_of is not None,
-        settings=s.modes,
-        attacks=s.attack,
+    held = HeldInputs.from_sets(task, sets, s.table) if task.effort.attacked else None
+    work = partial(
+        _retrained, task, s, sets, run.steady, run.partition, run.split, held, run.path / "logs"
     )
-    work = partial(_retrained, s, ground_of, warm_start, parts, table_of, run.path / "logs")
     done: list[tuple[ModePolicy, ModeResult]] = []
-    if run.task.mirror is None:
+    if task.mirror is None:
         done += cores.in_processes(work, sets.modes)
     else:  # the mirror image of the policy of one mode may do for the next
         for q in sets.modes:
@@ -144,30 +126,37 @@ def retrain_stage(run: Run, say: Say) -> None:
         policy.save(run.path / f"mode_{result.mode}.safetensors")
     Retraining(tuple(result for _, result in done)).save(run.path / "retraining.json")
     for _, result in done:
-        say(mode_sentence(run.task, result))
+        say(mode_sentence(task, result))
 
 
 def _retrained(
+    task: Task,
     settings: Settings,
-    ground_of: Callable[[int], ModeGround],
-    warm_start: WarmStart,
-    part_of: Callable[[int], PartPolicy] | None,
-    table_of: TableOf | None,
+    sets: ExtendedSets,
+    policy: Policy,
+    partition: Partition,
+    split: Partition,
+    held: HeldInputs | None,
     logs: Path,
     mode: int,
     others: Iterable[tuple[ModePolicy, ModeResult]] = (),
 ) -> tuple[ModePolicy, ModeResult]:
     """Trains the policy of one mode, which may happen in a process of a pool."""
-    from hyrl_mj.stages.retraining import retrain
+    from hyrl_mj.stages.grounds import mode_ground
+    from hyrl_mj.stages.retraining import retrain, start_policy
 
+    part = None
+    if task.effort.attacked:
+        part = part_policy(task, policy, partition, mode, sets.eps)
+    table, s = held is not None, settings
     return retrain(
-        ground_of(mode),
-        settings.stage6,
-        settings.seed,
-        warm_start=warm_start,
+        mode_ground(task, sets, mode, split, policy, table, s.modes, s.attack),
+        s.stage6,
+        s.seed,
+        warm_start=partial(start_policy, policy, partition),
         others=others,
-        part=None if part_of is None else part_of(mode),
-        table=table_of,
+        part=part,
+        table=None if held is None else partial(table_for, held),
         log_dir=logs / f"mode_{mode}",
     )
 

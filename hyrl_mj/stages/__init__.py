@@ -16,7 +16,7 @@ from hyrl_mj.stages.partition import (
     part_policy,
     with_room,
 )
-from hyrl_mj.stages.tables import HeldInputs, TableOf, TablePolicy, table_for
+from hyrl_mj.stages.tables import HeldInputs, TablePolicy, table_for
 
 __all__ = [
     "CriticalSet",
@@ -24,7 +24,6 @@ __all__ = [
     "HeldInputs",
     "PartPolicy",
     "Partition",
-    "TableOf",
     "TablePolicy",
     "all_part_policies",
     "boundary",

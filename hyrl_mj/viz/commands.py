@@ -25,28 +25,26 @@ def commands(run: Run, robustness: Robustness | None) -> list[str]:
 def beginning(run: Run, out: Path | None = None) -> str:
     """Returns the command that begins or continues such a run; a call if the agent is not from a file."""
     s, agent = run.settings, run.agent
-    if agent and not agent.source:
-        rest = "" if s.horizon is None else f", horizon={s.horizon}"
-        rest += ", all_coordinates=True" if s.everywhere else ""
-        noise = f"eps={s.eps}" if s.sensor is None else f"noise={s.sensor!r}"
-        rest += "" if out is None else f", out={str(out)!r}"
-        return (
-            f"hyrl_mj.robustify({s.task!r}, policy, {noise}, seed={s.seed}, "
-            f"preset={s.preset!r}{rest})"
-        )
-    words = ["hyrl-mj", *(["robustify", s.task, *agent.options] if agent else ["run", s.task])]
-    words += ["--eps", f"{s.eps}"] if s.sensor is None else ["--noise", s.sensor]
-    words += ["--seed", f"{s.seed}", "--preset", s.preset]
+    options: dict[str, object] = {"eps": s.eps} if s.sensor is None else {"noise": s.sensor}
+    options |= {"seed": s.seed, "preset": s.preset}
     if not agent and s.stage1.algorithm != run.task.learning.algorithm:
-        words += ["--algorithm", s.stage1.algorithm]
+        options["algorithm"] = s.stage1.algorithm
     if s.horizon is not None:
-        words += ["--horizon", f"{s.horizon}"]
+        options["horizon"] = s.horizon
     if s.everywhere:
-        words.append("--all-coordinates")
+        options["all_coordinates"] = True
     if not agent and (changes := _changes(run)):
-        words += ["--set", *(f"{name}={json.dumps(value)}" for name, value in changes.items())]
+        options["set"] = [f"{name}={json.dumps(value)}" for name, value in changes.items()]
     if out is not None:
-        words += ["--out", f"{out}"]
+        options["out"] = str(out)
+    if agent and not agent.source:
+        given = ", ".join(f"{name}={value!r}" for name, value in options.items())
+        return f"hyrl_mj.robustify({s.task!r}, policy, {given})"
+    words = ["hyrl-mj", *(["robustify", s.task, *agent.options] if agent else ["run", s.task])]
+    for name, value in options.items():
+        words.append(f"--{name.replace('_', '-')}")
+        if value is not True:
+            words += value if isinstance(value, list) else [f"{value}"]
     return shlex.join(words)
 
 
