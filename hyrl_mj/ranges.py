@@ -159,7 +159,7 @@ class Checked:
     """
 
     def __post_init__(self) -> None:
-        for name, rule in _rules(type(self)).items():
+        for name, rule in _rules(type(self)).items():  # type: ignore[arg-type]
             object.__setattr__(self, name, rule.checked(name, getattr(self, name)))
 
 

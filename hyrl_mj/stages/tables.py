@@ -164,9 +164,7 @@ class HeldInputs:
     @property
     def grid(self) -> Grid:
         """The grid of the extended sets and of the table."""
-        grid = self.extended.sets[0].grid
-        assert isinstance(grid, Grid)
-        return grid
+        return self.extended.sets[0].regular
 
     @cached_property
     def bound(self) -> np.ndarray:
