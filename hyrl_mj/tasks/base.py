@@ -142,7 +142,10 @@ class Task(ABC):
         return len(self.noisy)
 
     def plant(self, n: int, threads: int = 0) -> Plant:
-        """Returns n copies of the robot, stepped by a number of threads, 0 for one on every core."""
+        """Returns n copies of the robot, stepped by a number of threads, 0 for one on every core.
+
+        A task whose plant is something else returns that here, with the public methods of `Plant`.
+        """
         control = self.control if self.has_inner_loop else None
         return Plant(
             self.model, self.inputs, n, threads,
