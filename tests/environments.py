@@ -56,11 +56,7 @@ class Puck(gym.Env):
 
     def _get_obs(self):
         position = self.data.qpos.copy()
-        return {
-            "position": position,
-            "velocity": self.data.qvel.copy(),
-            "to_goal": GOAL - position,
-        }
+        return {"position": position, "velocity": self.data.qvel.copy(), "to_goal": GOAL - position}
 
     def step(self, action):
         self.data.ctrl[:] = np.clip(action, -4, 4)

@@ -251,10 +251,7 @@ def ideal_controller(task, overlap=0.15, clear=0.9):
     return HybridController(
         task,
         {0: one_way_policy(task, 1.0, clear), 1: one_way_policy(task, -1.0, clear)},
-        {
-            0: AnalyticSet(lambda z: -z[:, 1] - overlap),
-            1: AnalyticSet(lambda z: z[:, 1] - overlap),
-        },
+        {0: AnalyticSet(lambda z: -z[:, 1] - overlap), 1: AnalyticSet(lambda z: z[:, 1] - overlap)},
     )
 
 

@@ -213,8 +213,7 @@ def test_training_goes_on_from_an_agent_of_the_same_networks_only(circle, tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("algorithm", "name"),
-    [(PPO, "unit_circle"), (A2C, "vehicle"), (SAC, "unit_circle")],
+    ("algorithm", "name"), [(PPO, "unit_circle"), (A2C, "vehicle"), (SAC, "unit_circle")]
 )
 def test_it_draws_from_sb3s_distribution(algorithm, name, tmp_path):
     task = hyrl_mj.get_task(name)

@@ -400,10 +400,7 @@ def starting(memory):
 
 
 SPOILT = {
-    "hidden": (
-        Hidden,
-        r"the agent answers .* and, asked again .* without chance or another",
-    ),
+    "hidden": (Hidden, r"the agent answers .* and, asked again .* without chance or another"),
     "later": (HiddenLater, r"with a memory of .* and, asked again later, with a memory of"),
     "of the batch": (OfTheBatch, r"with a memory of .* and, in a batch of"),
     "grows": (Growing, r"of shape \(256, 7\) of one float64 of shape \(256, 5\): keep the shape"),

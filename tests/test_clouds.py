@@ -9,15 +9,7 @@ from planted import Hall, hall_distance, hall_level, hall_policy, hall_slope
 
 from hyrl_mj import BadInput, Chart, Noise, closed_loop
 from hyrl_mj.policies import HybridController, PolicyController
-from hyrl_mj.sets import (
-    Cloud,
-    Grid,
-    GridSet,
-    coarseness,
-    covering,
-    distance_to,
-    resolving,
-)
+from hyrl_mj.sets import Cloud, Grid, GridSet, coarseness, covering, distance_to, resolving
 from hyrl_mj.simulation import LoopSettings
 from hyrl_mj.stages import ExtendedSets, Partition, extend, find_critical_set, make_partition
 

@@ -138,10 +138,7 @@ def test_without_any_program_the_cure_is_said(tmp_path, monkeypatch):
 def test_an_error_of_who_draws_ends_the_program_and_is_his(tmp_path, program):
     program("echo $$ >&2; exec sleep 600")
     before = threading.active_count()
-    with (
-        pytest.raises(ZeroDivisionError),
-        video(tmp_path / "film.mp4", WIDTH, HEIGHT, 10),
-    ):
+    with pytest.raises(ZeroDivisionError), video(tmp_path / "film.mp4", WIDTH, HEIGHT, 10):
         raise ZeroDivisionError
     assert not list(tmp_path.glob("film*"))
     time.sleep(0.5)

@@ -91,71 +91,6 @@ def other():
     return functools.cache(lambda name: from_gymnasium(name, **OTHERS[name]))
 
 
-@others
-def test_copies_go_on_as_the_environment_alone_does(name, other):
-    task, rng = other(name), np.random.default_rng(0)
-    z = task.starts(3, rng)
-    plant = task.plant(3)
-    plant.set_state(*task.state(z))
-    inputs = rng.uniform(*task.input_limits, (20, 3, len(task.inputs)))
-    seen = []
-    for u in inputs:
-        plant.step(u)
-        seen.append(task.observation(plant.measurement))
-    for i in range(3):  # one after the other, in an environment of its own
-        instance = Instance(task.specification)
-        instance.reset()
-        instance.physics.write(task.specification.state_at(z)[i])
-        for k, u in enumerate(inputs):
-            observation, *_ = instance.env.step(instance.action(u[i]))
-            space = instance.env.observation_space
-            np.testing.assert_array_equal(flat(observation, space), seen[k][i])
-
-
-def test_an_environment_that_counts_its_steps_ends_the_episode_of_each_copy(other):
-    # After its last step dm_control resets the environment in the next step, whoever's it is.
-    task = other(PENDULUM)
-    assert task.max_steps == 60
-    three, alone = task.plant(3), task.plant(1)
-    for plant, angles in ((three, [0.0, 1.0, 2.0]), (alone, [1.0])):
-        plant.set_state(*task.state(np.column_stack([angles, np.zeros(plant.n)])))
-        for _ in range(task.max_steps):
-            plant.step(np.zeros((plant.n, 1)))
-    np.testing.assert_array_equal(three.qpos[1], alone.qpos[0])
-    # It counts its steps itself. What succeeds at the last of them has arrived: the first stands upright.
-    assert task.ending(three.measurement).tolist() == [
-        Outcome.REACHED,
-        Outcome.STALLED,
-        Outcome.STALLED,
-    ]
-
-
-@others
-def test_the_tasks_of_other_packages_are_complete(name, other, monkeypatch):
-    monkeypatch.setattr(trial, "STEPS", 5_000)  # of the physics, in all episodes
-    monkeypatch.setattr(trial, "FEWEST", 4)
-    task = other(name)
-    check_task(task)
-    assert set(task.found) >= {"bounds", "starts", "ways"}
-    point_of(task.model, task.scene.tracked)
-    camera_of(task.model, task.scene.camera)
-
-
-@pytest.mark.parametrize(
-    ("name", "islands"),
-    [
-        pytest.param("PointMaze_Medium-v3", 1, marks=pytest.mark.long),
-        (MAZE, 3),
-        ("pointmaze-medium-singletask-v0", 1),
-        ("Reacher-v5", 0),
-    ],
-)
-def test_islands_are_the_walls_that_can_be_passed_on_both_sides(name, islands, other):
-    task = other(name)
-    assert len(task.obstacles) == islands
-    assert task.gives_direction == (islands == 0)
-
-
 def test_noise_moves_every_copy_of_a_position(puck):
     plant = puck.plant(1)
     plant.set_state(np.array([[-1.0, 0.5]]), np.array([[0.3, 0.0]]))
@@ -558,34 +493,6 @@ def test_a_free_joint_has_places_that_a_chart_may_name_but_no_orientation():
         coordinates(task._instance, ["qpos[0]", "qpos[4]"])
 
 
-def test_a_task_is_made_again_from_its_text(other):
-    task = other(MAZE)
-    assert reference(task).startswith("env:")
-    assert described_task(reference(task)) is task
-    assert pickle.loads(pickle.dumps(task)).chart == task.chart
-    assert hyrl_mj.get_task(task) is task
-    loud = task.noisy_everywhere()
-    assert pickle.loads(pickle.dumps(loud)).noisy == loud.noisy
-    with pytest.raises(BadInput, match="describes no environment"):
-        described_task("env:{}")
-    with pytest.raises(BadInput, match="imports no module that you have not used before"):
-        described_task('env:{"env": "this:Puck-v0"}')
-    with pytest.raises(BadInput, match="made by the function elsewhere"):
-        described_task('env:{"env": {"function": "elsewhere"}}')
-
-
-def test_a_target_that_is_drawn_is_pinned_as_the_message_says(other):
-    given = OTHERS["Reacher-v5"]
-    with pytest.raises(BadInput, match="draws qpos") as refused:
-        from_gymnasium("Reacher-v5", chart="qpos[0]", success=given["success"])
-    assert "goal_cell" not in str(refused.value)
-    advised = json.loads(re.search(r"with values as (\{.*?\}\})", str(refused.value))[1])
-    assert advised == {"pinned": dict.fromkeys(given["pinned"], 0.1)}
-    found = other("Reacher-v5").specification
-    pinned = {f"qpos[{i}]": found.state[found.qpos[i]] for i in (2, 3)}
-    assert pinned == pytest.approx(given["pinned"])
-
-
 def test_what_mujoco_warns_of_while_it_reads_a_model_is_not_written_to_a_file(tmp_path):
     words = ("run", "--env", "HalfCheetah-v5", "--success", "reward >= 1")
     done = command(*words, cwd=tmp_path)
@@ -640,6 +547,136 @@ def test_an_agent_that_is_missing_is_said_before_the_environment_is_tried_out(tm
     assert "there is no file" in error
 
 
+def test_free_cameras_are_there_for_every_model(puck):
+    model = puck.model
+    assert rests(model, camera_of(model, "free"))
+    assert camera_of(model, "overhead").elevation == -90
+    assert point_of(model, "tracked") == ("xpos", 1)
+    with pytest.raises(BadInput, match=r"'chase'.*overhead, free"):
+        camera_of(model, "chase")
+
+
+def test_an_agent_is_diagnosed_and_made_robust_in_its_own_environment(tmp_path, monkeypatch):
+    spare_environments(monkeypatch)
+    without_pdfs(monkeypatch)
+    monkeypatch.setitem(presets._GRIDS_DYNAMIC, 2, (16, 24))  # coarser than preset smoke
+    few = {"episodes": 12, "attack_starts": 16, "attack_rounds": 1}
+    monkeypatch.setattr(steps, "SPARING", replace(steps.SPARING, **few))
+    task = from_gymnasium(Puck, steps=38, bounds={"x": (-1.7, 1.8), "y": (-1.2, 1.2)})
+    path, said = tmp_path / "puck", []
+    options = {"preset": "smoke", "eps": 0.1, "out": path, "say": said.append}
+    diagnosed = hyrl_mj.diagnose(task, puck_agent, **options)
+    assert (path / "diagnosis.html").is_file()
+    points = diagnosed.critical_set.points
+    assert len(points) > 5
+    assert (np.abs(points[points[:, 0] < -0.5, 1]) < 0.05).all()
+    run = hyrl_mj.robustify(task, puck_agent, **options)
+    assert (path / "replay.png").is_file()
+    lost = {count.controller: count.lost for count in run.robustness.attacks}
+    assert lost["hyrl"] < lost["policy"]
+    again = hyrl_mj.load_run(path, puck_agent)
+    q, measured = np.array([0, 1]), np.tile(task.plant(1).measurement, (2, 1))
+    np.testing.assert_array_equal(
+        again.controller.step(q, measured)[0], run.controller.step(q, measured)[0]
+    )
+
+
+# ---- of other packages; last, because their many copies take memory that each new process would copy
+
+
+@others
+def test_copies_go_on_as_the_environment_alone_does(name, other):
+    task, rng = other(name), np.random.default_rng(0)
+    z = task.starts(3, rng)
+    plant = task.plant(3)
+    plant.set_state(*task.state(z))
+    inputs = rng.uniform(*task.input_limits, (20, 3, len(task.inputs)))
+    seen = []
+    for u in inputs:
+        plant.step(u)
+        seen.append(task.observation(plant.measurement))
+    for i in range(3):  # one after the other, in an environment of its own
+        instance = Instance(task.specification)
+        instance.reset()
+        instance.physics.write(task.specification.state_at(z)[i])
+        for k, u in enumerate(inputs):
+            observation, *_ = instance.env.step(instance.action(u[i]))
+            space = instance.env.observation_space
+            np.testing.assert_array_equal(flat(observation, space), seen[k][i])
+
+
+def test_an_environment_that_counts_its_steps_ends_the_episode_of_each_copy(other):
+    # After its last step dm_control resets the environment in the next step, whoever's it is.
+    task = other(PENDULUM)
+    assert task.max_steps == 60
+    three, alone = task.plant(3), task.plant(1)
+    for plant, angles in ((three, [0.0, 1.0, 2.0]), (alone, [1.0])):
+        plant.set_state(*task.state(np.column_stack([angles, np.zeros(plant.n)])))
+        for _ in range(task.max_steps):
+            plant.step(np.zeros((plant.n, 1)))
+    np.testing.assert_array_equal(three.qpos[1], alone.qpos[0])
+    # It counts its steps itself. What succeeds at the last of them has arrived: the first stands upright.
+    assert task.ending(three.measurement).tolist() == [
+        Outcome.REACHED,
+        Outcome.STALLED,
+        Outcome.STALLED,
+    ]
+
+
+@others
+def test_the_tasks_of_other_packages_are_complete(name, other, monkeypatch):
+    monkeypatch.setattr(trial, "STEPS", 5_000)  # of the physics, in all episodes
+    monkeypatch.setattr(trial, "FEWEST", 4)
+    task = other(name)
+    check_task(task)
+    assert set(task.found) >= {"bounds", "starts", "ways"}
+    point_of(task.model, task.scene.tracked)
+    camera_of(task.model, task.scene.camera)
+
+
+@pytest.mark.parametrize(
+    ("name", "islands"),
+    [
+        pytest.param("PointMaze_Medium-v3", 1, marks=pytest.mark.long),
+        (MAZE, 3),
+        ("pointmaze-medium-singletask-v0", 1),
+        ("Reacher-v5", 0),
+    ],
+)
+def test_islands_are_the_walls_that_can_be_passed_on_both_sides(name, islands, other):
+    task = other(name)
+    assert len(task.obstacles) == islands
+    assert task.gives_direction == (islands == 0)
+
+
+def test_a_task_is_made_again_from_its_text(other):
+    task = other(MAZE)
+    assert reference(task).startswith("env:")
+    assert described_task(reference(task)) is task
+    assert pickle.loads(pickle.dumps(task)).chart == task.chart
+    assert hyrl_mj.get_task(task) is task
+    loud = task.noisy_everywhere()
+    assert pickle.loads(pickle.dumps(loud)).noisy == loud.noisy
+    with pytest.raises(BadInput, match="describes no environment"):
+        described_task("env:{}")
+    with pytest.raises(BadInput, match="imports no module that you have not used before"):
+        described_task('env:{"env": "this:Puck-v0"}')
+    with pytest.raises(BadInput, match="made by the function elsewhere"):
+        described_task('env:{"env": {"function": "elsewhere"}}')
+
+
+def test_a_target_that_is_drawn_is_pinned_as_the_message_says(other):
+    given = OTHERS["Reacher-v5"]
+    with pytest.raises(BadInput, match="draws qpos") as refused:
+        from_gymnasium("Reacher-v5", chart="qpos[0]", success=given["success"])
+    assert "goal_cell" not in str(refused.value)
+    advised = json.loads(re.search(r"with values as (\{.*?\}\})", str(refused.value))[1])
+    assert advised == {"pinned": dict.fromkeys(given["pinned"], 0.1)}
+    found = other("Reacher-v5").specification
+    pinned = {f"qpos[{i}]": found.state[found.qpos[i]] for i in (2, 3)}
+    assert pinned == pytest.approx(given["pinned"])
+
+
 @pytest.mark.parametrize(
     ("name", "tracked", "kind"),
     [
@@ -656,15 +693,6 @@ def test_replays_draw_the_path_of_what_goes_farthest(name, tracked, kind, other)
     assert point_of(task.model, tracked)[0] == kind
     points = tracked_points(task, task.state(task.starts(20, np.random.default_rng(0)))[0])
     assert np.ptp(points, axis=0).max() > 0.1
-
-
-def test_free_cameras_are_there_for_every_model(puck):
-    model = puck.model
-    assert rests(model, camera_of(model, "free"))
-    assert camera_of(model, "overhead").elevation == -90
-    assert point_of(model, "tracked") == ("xpos", 1)
-    with pytest.raises(BadInput, match=r"'chase'.*overhead, free"):
-        camera_of(model, "chase")
 
 
 def test_the_command_line_explains_what_was_found(tmp_path, other):
@@ -705,28 +733,3 @@ def test_the_command_line_explains_what_was_found(tmp_path, other):
     assert "goal.json cannot be read" in error
     assert "not both" in command("run", "vehicle", "--env", "Reacher-v5")[2]
     assert "need an --env" in command("run", "vehicle", "--explain")[2]
-
-
-def test_an_agent_is_diagnosed_and_made_robust_in_its_own_environment(tmp_path, monkeypatch):
-    spare_environments(monkeypatch)
-    without_pdfs(monkeypatch)
-    monkeypatch.setitem(presets._GRIDS_DYNAMIC, 2, (16, 24))  # coarser than preset smoke
-    few = {"episodes": 12, "attack_starts": 16, "attack_rounds": 1}
-    monkeypatch.setattr(steps, "SPARING", replace(steps.SPARING, **few))
-    task = from_gymnasium(Puck, steps=38, bounds={"x": (-1.7, 1.8), "y": (-1.2, 1.2)})
-    path, said = tmp_path / "puck", []
-    options = {"preset": "smoke", "eps": 0.1, "out": path, "say": said.append}
-    diagnosed = hyrl_mj.diagnose(task, puck_agent, **options)
-    assert (path / "diagnosis.html").is_file()
-    points = diagnosed.critical_set.points
-    assert len(points) > 5
-    assert (np.abs(points[points[:, 0] < -0.5, 1]) < 0.05).all()
-    run = hyrl_mj.robustify(task, puck_agent, **options)
-    assert (path / "replay.png").is_file()
-    lost = {count.controller: count.lost for count in run.robustness.attacks}
-    assert lost["hyrl"] < lost["policy"]
-    again = hyrl_mj.load_run(path, puck_agent)
-    q, measured = np.array([0, 1]), np.tile(task.plant(1).measurement, (2, 1))
-    np.testing.assert_array_equal(
-        again.controller.step(q, measured)[0], run.controller.step(q, measured)[0]
-    )

@@ -139,22 +139,18 @@ def test_the_vector_env_plays_the_episodes_of_the_single_env(task):
 # ---- how episodes end
 
 
-def test_a_crash_terminates():
-    _, _, terminated, truncated, info = vehicle_outcome([0.0, 0.0], AHEAD)
-    assert (terminated, truncated, info["outcome"]) == (True, False, "crashed")
-    assert info["z"] == pytest.approx([0.75, 0.0], abs=1e-6)
-
-
-def test_leaving_the_arena_terminates():
-    _, _, terminated, truncated, info = vehicle_outcome([0.0, 0.51], LEFT)
-    assert (terminated, truncated, info["outcome"]) == (True, False, "out_of_bounds")
-    assert info["z"] == pytest.approx([1.0, 1.51], abs=1e-6)
-
-
-def test_crossing_the_line_terminates():
-    _, _, terminated, truncated, info = vehicle_outcome([0.2, 1.0], AHEAD)
-    assert (terminated, truncated, info["outcome"]) == (True, False, "reached")
-    assert info["z"] == pytest.approx([3.05, 1.0], abs=1e-6)
+@pytest.mark.parametrize(
+    ("start", "action", "outcome", "end"),
+    [
+        ([0.0, 0.0], AHEAD, "crashed", [0.75, 0.0]),
+        ([0.0, 0.51], LEFT, "out_of_bounds", [1.0, 1.51]),
+        ([0.2, 1.0], AHEAD, "reached", [3.05, 1.0]),
+    ],
+)
+def test_a_crash_leaving_the_arena_and_crossing_the_line_terminate(start, action, outcome, end):
+    _, _, terminated, truncated, info = vehicle_outcome(start, action)
+    assert (terminated, truncated, info["outcome"]) == (True, False, outcome)
+    assert info["z"] == pytest.approx(end, abs=1e-6)
 
 
 def test_the_end_of_time_truncates():

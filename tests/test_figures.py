@@ -397,11 +397,7 @@ def test_of_three_dimensions_a_section_is_drawn_and_the_runs_over_time():
         replays=arcs,
     )
     assert figures.names(cube, figures.ShownRun) == NAMES
-    for draw_one in (
-        figures.draw_overview,
-        figures.draw_policy_map,
-        figures.draw_extended_sets,
-    ):
+    for draw_one in (figures.draw_overview, figures.draw_policy_map, figures.draw_extended_sets):
         figure = draw_one(shown)
         assert figure.get_suptitle().startswith("Cube at c = -0.3 m: ")
         assert (figure.axes[0].get_xlabel(), figure.axes[0].get_ylabel()) == ("a [m]", "b [m]")

@@ -400,43 +400,33 @@ def test_values_converge_as_the_lattice_gets_finer(circle):
 # ---- unit circle: for ever
 
 
-@pytest.mark.parametrize("eps", [0.0, 0.05, 0.1])
-def test_a_deadbeat_policy_is_held_within_the_noise(circle, eps):
-    lattice = Lattice.tabulate(circle, Grid.with_cells(circle.chart, EXACT))
-    loop, bound = PolicyController(homing_policy(circle)), np.array([eps])
-    near = circle.miss(lattice.grid.nodes) < 1
-    held = lasting(noisy_moves(Answers.ask(lattice, loop, bound), bound), near)
-    cell = lattice.grid.cell
-    assert eps - cell <= circle.miss(lattice.grid.nodes[held]).max() <= eps + 2 * cell
-
-
-@pytest.mark.parametrize("dead", [0.1, 0.3])
-def test_a_policy_with_a_dead_zone_is_held_at_its_edge_and_the_noise(circle, dead):
-    eps = 0.1
+def homing_moves(circle, eps=0.1, dead=0.0):
+    """The moves of the homing policy under noise, how far off its nodes are (n,), and a cell [rad]."""
     lattice = Lattice.tabulate(circle, Grid.with_cells(circle.chart, EXACT))
     loop, bound = PolicyController(homing_policy(circle, dead)), np.array([eps])
-    near = circle.miss(lattice.grid.nodes) < 1
-    held = lasting(noisy_moves(Answers.ask(lattice, loop, bound), bound), near)
-    reach = circle.miss(lattice.grid.nodes[held]).max()
-    assert reach == pytest.approx(dead + eps, abs=2 * lattice.grid.cell)
+    moves = noisy_moves(Answers.ask(lattice, loop, bound), bound)
+    return moves, circle.miss(lattice.grid.nodes), lattice.grid.cell
+
+
+@pytest.mark.parametrize(
+    ("eps", "dead", "less"), [(0.0, 0, 1), (0.05, 0, 1), (0.1, 0, 1), (0.1, 0.1, 2), (0.1, 0.3, 2)]
+)
+def test_a_policy_is_held_at_the_edge_of_its_dead_zone_and_the_noise(circle, eps, dead, less):
+    moves, miss, cell = homing_moves(circle, eps, dead)
+    reach = miss[lasting(moves, miss < 1)].max()
+    assert dead + eps - less * cell <= reach <= dead + eps + 2 * cell
 
 
 def test_runs_are_not_held_where_they_never_come(circle):
     # At the far side noise can hold a memoryless policy; runs from near the set-point never get there.
-    lattice = Lattice.tabulate(circle, Grid.with_cells(circle.chart, EXACT))
-    loop, bound = PolicyController(homing_policy(circle)), np.array([0.1])
-    moves = noisy_moves(Answers.ask(lattice, loop, bound), bound)
-    miss = circle.miss(lattice.grid.nodes)
-    assert miss[lasting(moves)].max() == pytest.approx(PI, abs=lattice.grid.cell)
-    assert miss[lasting(moves, miss > 3)].max() == pytest.approx(PI, abs=lattice.grid.cell)
+    moves, miss, cell = homing_moves(circle)
+    assert miss[lasting(moves)].max() == pytest.approx(PI, abs=cell)
+    assert miss[lasting(moves, miss > 3)].max() == pytest.approx(PI, abs=cell)
     assert miss[lasting(moves, miss < 3)].max() < 0.2
 
 
 def test_runs_are_held_where_they_come_in_the_end(circle):
-    lattice = Lattice.tabulate(circle, Grid.with_cells(circle.chart, EXACT))
-    loop, bound = PolicyController(homing_policy(circle)), np.array([0.1])
-    moves = noisy_moves(Answers.ask(lattice, loop, bound), bound)
-    miss = circle.miss(lattice.grid.nodes)
+    moves, miss, _ = homing_moves(circle)
     from_afar = lasting(moves, (miss > 1) & (miss < 3))
     np.testing.assert_array_equal(from_afar, lasting(moves, miss < 1))
     assert from_afar.any()

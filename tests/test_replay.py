@@ -25,14 +25,7 @@ from hyrl_mj.viz import ReplayOptions
 from hyrl_mj.viz.colours import BAD, CRITICAL, GOOD, MODES, OPEN, OVERLAP, POLICY, WHITE
 from hyrl_mj.viz.replay import Show, render_replay
 from hyrl_mj.viz.replay.captions import Layout
-from hyrl_mj.viz.replay.marks import (
-    CRITICAL_RADIUS,
-    Floor,
-    Floors,
-    bar,
-    disc,
-    tracked_points,
-)
+from hyrl_mj.viz.replay.marks import CRITICAL_RADIUS, Floor, Floors, bar, disc, tracked_points
 from hyrl_mj.viz.replay.panel import Panel, Track
 from hyrl_mj.viz.replay.screen import AROUND, HOLD, frame_times
 from hyrl_mj.viz.section import Section

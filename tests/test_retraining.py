@@ -4,14 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from planted import (
-    ChartPolicy,
-    decisions,
-    halves,
-    homing_policy,
-    ideal_controller,
-    one_way_policy,
-)
+from planted import ChartPolicy, decisions, halves, homing_policy, ideal_controller, one_way_policy
 
 from hyrl_mj import Sensor, closed_loop
 from hyrl_mj.gym_export import BatchedEnv

@@ -276,12 +276,7 @@ def test_episodes_stand_in_for_the_game_where_the_policy_draws(circle, tmp_path)
     path = saved(untrained(PPO, circle), tmp_path)
     said = []
     run = hyrl_mj.diagnose(
-        "unit_circle",
-        path,
-        stochastic=True,
-        out=tmp_path / "run",
-        preset="smoke",
-        say=said.append,
+        "unit_circle", path, stochastic=True, out=tmp_path / "run", preset="smoke", say=said.append
     )
     assert run.agent.stochastic
     assert not run.exact

@@ -17,14 +17,7 @@ from planted import (
 from hyrl_mj import BadArtifact, BadInput, Noise, simulate
 from hyrl_mj.files import artifacts
 from hyrl_mj.judging import worst_case as examination
-from hyrl_mj.judging.game import (
-    CURVE,
-    LIMIT,
-    Game,
-    MapClass,
-    Robustness,
-    worst_signal,
-)
+from hyrl_mj.judging.game import CURVE, LIMIT, Game, MapClass, Robustness, worst_signal
 from hyrl_mj.judging.game.solver import NEVER
 from hyrl_mj.judging.worst_case import worst_case
 from hyrl_mj.policies.controllers import PolicyController
@@ -191,11 +184,9 @@ def test_what_nobody_reaches_in_time_is_not_winnable(circle):
 @pytest.mark.parametrize("name", ["narrow", "ideal", "grazing"])
 def test_the_margin_of_the_ideal_rule_is_its_overlap_or_its_clearance(on_vehicle, name):
     # Beyond its overlap noise turns a run back that has no room left; the pillar is at 0.751 m.
-    overlap, clear = {
-        "narrow": (0.104, 1.004),
-        "ideal": (0.154, 1.004),
-        "grazing": (0.204, 0.904),
-    }[name]
+    overlap, clear = {"narrow": (0.104, 1.004), "ideal": (0.154, 1.004), "grazing": (0.204, 0.904)}[
+        name
+    ]
     game, _ = on_vehicle
     known = min(overlap, clear - 0.751)
     assert game.margin(name) == pytest.approx(known, abs=game.lattice.grid.cell)
@@ -291,10 +282,9 @@ CELLS = {"vehicle": 120, "unit_circle": EXACT}
 
 @pytest.fixture(scope="module", params=CELLS)
 def examined(request, vehicle, circle, on_vehicle, on_circle):
-    task, (_, controllers) = {
-        "vehicle": (vehicle, on_vehicle),
-        "unit_circle": (circle, on_circle),
-    }[request.param]
+    task, (_, controllers) = {"vehicle": (vehicle, on_vehicle), "unit_circle": (circle, on_circle)}[
+        request.param
+    ]
     named = {"policy": controllers["sign"], "hyrl": controllers[list(controllers)[-1]]}
     cells = CELLS[request.param]
     result, maps = worst_case(

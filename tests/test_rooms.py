@@ -116,9 +116,7 @@ except SystemExit:
 
 
 @pytest.mark.parametrize(
-    ("code", "heavy"),
-    [("import hyrl_mj", HEAVY | {"tyro"}), (HELP, HEAVY)],
-    ids=["import", "help"],
+    ("code", "heavy"), [("import hyrl_mj", HEAVY | {"tyro"}), (HELP, HEAVY)], ids=["import", "help"]
 )
 def test_nothing_heavy_is_loaded_before_it_is_needed(code, heavy):
     out = run_without(set(), f"{code}\nimport sys; print(sorted({heavy} & set(sys.modules)))")

@@ -13,15 +13,7 @@ from hyrl_mj import BadArtifact, BadInput, Outcome
 from hyrl_mj.files import artifacts
 from hyrl_mj.files.manifest import FILES
 from hyrl_mj.judging.game import Lattice
-from hyrl_mj.learning import (
-    Settings,
-    Training,
-    changed,
-    changes,
-    differing,
-    preset,
-    training,
-)
+from hyrl_mj.learning import Settings, Training, changed, changes, differing, preset, training
 from hyrl_mj.learning.options import OPTIONS, OWN
 from hyrl_mj.policies import algorithms
 from hyrl_mj.runs.directory import Config, Run

@@ -10,11 +10,7 @@ import numpy as np
 import pytest
 from environments import GOAL, XML, Puck
 from gymnasium import spaces
-from gymnasium.wrappers import (
-    DelayObservation,
-    FlattenObservation,
-    FrameStackObservation,
-)
+from gymnasium.wrappers import DelayObservation, FlattenObservation, FrameStackObservation
 
 from hyrl_mj import BadInput, Noise, closed_loop, from_callable, from_gymnasium, simulate
 from hyrl_mj.policies import PolicyController

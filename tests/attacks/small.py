@@ -58,6 +58,7 @@ LATE = (
     "pydantic.type_adapter",
     "scipy.sparse.linalg",
     "scipy.spatial",
+    "scipy.stats",
     "stable_baselines3",
     "tensorboard",
     "torch._dynamo",
