@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import product
 from typing import Any, NamedTuple
 
 import mujoco
@@ -13,12 +14,18 @@ from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.gym_import.instance import Instance
 from hyrl_mj.gym_import.observations import columns_of
 from hyrl_mj.gym_import.opening import AnyChart
-from hyrl_mj.gym_import.specification import Coordinate
+from hyrl_mj.gym_import.specification import Axis, Coordinate
 from hyrl_mj.physics import mjcf
 from hyrl_mj.tasks import touching
 
-FREE, SLIDE, HINGE = map(
-    int, (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)
+FREE, BALL, SLIDE, HINGE = map(
+    int,
+    (
+        mujoco.mjtJoint.mjJNT_FREE,
+        mujoco.mjtJoint.mjJNT_BALL,
+        mujoco.mjtJoint.mjJNT_SLIDE,
+        mujoco.mjtJoint.mjJNT_HINGE,
+    ),
 )
 JOINT, SITE, BODY = mujoco.mjtObj.mjOBJ_JOINT, mujoco.mjtObj.mjOBJ_SITE, mujoco.mjtObj.mjOBJ_BODY
 
@@ -174,10 +181,57 @@ def walls(model: mujoco.MjModel) -> np.ndarray:
     return np.flatnonzero(~moves & ~is_plane & (collides | named))
 
 
+def axes_of(instance: Instance) -> tuple[Axis | None, ...]:
+    """Returns the axis of each coordinate of the chart; None where it moves along none, as where it turns.
+
+    All joints of the robot are moved, and the place of the body that hangs on the coordinates in metres is
+    read: in a frame that is turned, or on a base that turns, no axis follows.
+    """
+    spec, model, data = instance.spec, instance.model, instance.data
+    moving = [c for c in spec.coordinates if c.kind == "qpos" and c.axis is not None]
+    if not moving:
+        return (None,) * len(spec.coordinates)
+    body = max(int(model.jnt_bodyid[c.joint]) for c in moving)
+    joints = np.flatnonzero(
+        robot_of(model, spec.coordinates)[model.jnt_bodyid] & (model.jnt_type != BALL)
+    )
+    before = instance.physics.read()
+    states = np.tile(before, (8, 1))
+    rng, places = np.random.default_rng(0), []
+    for joint in joints.tolist():
+        width = 3 if model.jnt_type[joint] == FREE else 1  # no orientation
+        at = spec.qpos[model.jnt_qposadr[joint] + np.arange(width)]
+        states[:, at] += rng.uniform(-0.1, 0.1, (len(states), width))
+    for state in states:
+        instance.physics.write(state)
+        places.append(_middle(model, data, body))
+    instance.physics.write(before)
+    z, found = spec.z(states), list[Axis | None]()
+    for i, c in enumerate(spec.coordinates):
+        found.append(None)
+        if c not in moving:
+            continue
+        for sign, number in product((1.0, -1.0), range(3)):
+            shift = np.array(places)[:, number] - sign * z[:, i]
+            if np.ptp(shift) < 1e-6:
+                found[i] = Axis(number, sign, round(float(shift.mean()), 9))
+    return tuple(found)
+
+
+def _middle(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> np.ndarray:
+    """Returns the place (3,) of a body: its origin, or if none of its geoms reaches that, of the nearest."""
+    geoms = np.flatnonzero(model.body_weldid[model.geom_bodyid] == model.body_weldid[body])
+    place = np.array(data.xpos[body])
+    off = np.linalg.norm(data.geom_xpos[geoms] - place, axis=1)
+    if len(geoms) and (off > model.geom_rbound[geoms]).all():
+        return np.array(data.geom_xpos[geoms[off.argmin()]])
+    return place
+
+
 def bounds_of(
     instance: Instance, met: np.ndarray, begun: np.ndarray
-) -> tuple[list[Bound], dict[str, int]]:
-    """Returns the ends of the chart's coordinates, and what can be passed on both sides: `islands` of a spec.
+) -> tuple[list[Bound], dict[str, int], tuple[Axis, ...]]:
+    """Returns the ends of the chart's coordinates, and the `islands` and the `plane` of a specification.
 
     Walls that touch each other are one. Those around all sampled runs are the end of the chart in the plane;
     the others can be passed, and there is room for that.
@@ -189,10 +243,14 @@ def bounds_of(
     """
     spec, model, data = instance.spec, instance.model, instance.data
     ids, others, islands = list[int](), list[int](), dict[str, int]()
-    if len(spec.coordinates) >= 2 and all(c.unit == "m" for c in spec.coordinates[:2]):
-        places = (met - spec.offset)[:, :2]
+    axes, plane = axes_of(instance), tuple[Axis, ...]()
+    pair = [axis for axis in axes[:2] if axis is not None]
+    if len({axis.number for axis in pair}) == 2:
+        plane = tuple(pair)
+        across = [axis.number for axis in plane]
+        places = np.column_stack([axis.world(met[:, i]) for i, axis in enumerate(plane)])
         for geoms in touching(model, data, walls(model).tolist()):
-            centres, size = data.geom_xpos[geoms][:, :2], model.geom_rbound[geoms][:, None]
+            centres, size = data.geom_xpos[geoms][:, across], model.geom_rbound[geoms][:, None]
             low, high = (centres - size).min(axis=0), (centres + size).max(axis=0)
             if ((low < places) & (places < high)).all():
                 ids += geoms
@@ -205,34 +263,50 @@ def bounds_of(
         2 * float(model.geom_rbound[spec.solid].max(initial=0.0)),
     )
     found = []
-    for i, c in enumerate(spec.coordinates):
+    for i, (c, axis) in enumerate(zip(spec.coordinates, axes, strict=True)):
         if c.name in spec.description.bounds:
             low, high = spec.description.bounds[c.name]
             found.append(Bound(float(low), float(high), False, "given"))
         elif c.kind == "qpos" and model.jnt_limited[c.joint]:
             low, high = model.jnt_range[c.joint] + c.offset
             found.append(Bound(float(low), float(high), False, "the range of its joint"))
-        elif c.kind == "qpos" and c.axis is None:
+        elif c.kind == "qpos" and c.axis is None and _turns_alike(instance, c, begun):
             found.append(Bound(-np.pi + c.offset, np.pi + c.offset, True, "a joint without limits"))
-        elif c.kind == "qpos" and ids:
-            found.append(Bound(*_extent(instance, ids, c, 0.0), False, "the walls"))
+        elif axis and ids:
+            found.append(Bound(*axis.interval(*_extent(instance, ids, axis)), False, "the walls"))
         else:
             middle, half = np.median(samples[:, i]), np.ptp(samples[:, i]) / 2
             half = max(1.2 * half, 1e-3)  # what is farther than sampled runs go is outside
             low, high, why = float(middle - half), float(middle + half), "sampled runs"
-            if c.kind == "qpos" and others:
-                ends = _extent(instance, others, c, passing)
+            if axis and others:
+                first, last = _extent(instance, others, axis)
+                ends = axis.interval(first - passing, last + passing)
                 low, high, why = min(low, ends[0]), max(high, ends[1]), "sampled runs and walls"
             found.append(Bound(low, high, False, why))
-    return found, islands
+    return found, islands, plane
 
 
-def _extent(
-    instance: Instance, geoms: Sequence[int], c: Coordinate, room: float
-) -> tuple[float, float]:
-    """Returns the ends of geoms along the axis of a coordinate, with room beside them."""
+def _extent(instance: Instance, geoms: Sequence[int], axis: Axis) -> tuple[float, float]:
+    """Returns the ends of boxes around geoms along an axis of the world [m]."""
     rows: Any = list(geoms)
-    places, sizes = instance.data.geom_xpos[rows][:, c.axis], instance.model.geom_size[rows]
-    is_box = instance.model.geom_type[rows] == mujoco.mjtGeom.mjGEOM_BOX
-    size = np.where(is_box, sizes[:, c.axis], sizes[:, 0])
-    return float((places - size).min()) - room, float((places + size).max()) + room
+    turned = instance.data.geom_xmat[rows].reshape(-1, 3, 3)[:, axis.number]
+    middle, half = np.split(instance.model.geom_aabb[rows], 2, axis=1)
+    places = instance.data.geom_xpos[rows][:, axis.number] + (turned * middle).sum(axis=1)
+    size = (np.abs(turned) * half).sum(axis=1)
+    return float((places - size).min()), float((places + size).max())
+
+
+def _turns_alike(instance: Instance, c: Coordinate, begun: np.ndarray) -> bool:
+    """Returns whether a whole turn of a coordinate changes nothing of what is seen, after steps, too."""
+    spec, rng = instance.spec, np.random.default_rng(0)
+    i = spec.coordinates.index(c)
+    for z in begun[:4]:
+        inputs, seen = [instance.drawn(rng)] * 4, []
+        for turn in (0.0, 2 * np.pi, -2 * np.pi):
+            start = spec.state_at((z + turn * (np.arange(len(z)) == i))[None])[0]
+            runs = instance.play(start, inputs, np.zeros((len(inputs) + 1, len(z))))
+            seen.append(np.concatenate([np.append(one.observation, one.report) for one in runs]))
+        usual, *turned = seen
+        if not all(np.allclose(usual, other, 1e-6, 1e-6, equal_nan=True) for other in turned):
+            return False
+    return True

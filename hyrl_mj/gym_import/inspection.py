@@ -294,7 +294,7 @@ def _learn_bounds(instance: Instance, met: np.ndarray, begun: np.ndarray) -> Non
     for name in given.bounds:
         if name not in names:
             raise BadInput(f"bounds for {name} cannot be used: the chart has {', '.join(names)}")
-    bounds, islands = bounds_of(instance, met, begun)
+    bounds, islands, plane = bounds_of(instance, met, begun)
     found["bounds"] = ", ".join(
         f"{name} {b.low:.3g} to {b.high:.3g} (from {b.why})"
         for name, b in zip(names, bounds, strict=True)
@@ -316,6 +316,7 @@ def _learn_bounds(instance: Instance, met: np.ndarray, begun: np.ndarray) -> Non
     instance.learn(
         chart=Chart(names, tuple(c.unit for c in spec.coordinates), low, high, periodic),
         islands=islands,
+        plane=plane,
         start_low=start_low,
         start_high=start_high,
         max_steps=max_steps,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -51,6 +51,26 @@ class Coordinate:
     def described(self) -> str:
         """Returns what it stands for: "qpos[0]"."""
         return f"{self.kind}[{self.index}]"
+
+
+class Axis(NamedTuple):
+    """The axis of the world along which a coordinate of the chart moves the robot.
+
+    The robot is at `sign` times the coordinate plus `shift` [m] on the axis `number`, 0 to 2.
+    """
+
+    number: int
+    sign: float
+    shift: float
+
+    def world(self, z: np.ndarray) -> np.ndarray:
+        """Returns places on the axis [m] for values of the coordinate."""
+        return self.sign * z + self.shift
+
+    def interval(self, low: float, high: float) -> tuple[float, float]:
+        """Returns the ends of the coordinate between two places on the axis [m]."""
+        ends = sorted(self.sign * (end - self.shift) for end in (low, high))
+        return ends[0], ends[1]
 
 
 @dataclass(frozen=True)
@@ -164,6 +184,7 @@ class EnvironmentSpec:
         start_low, start_high: corners (d,) of the box of starts.
         max_steps: samples of an episode.
         islands: what can be passed on both sides, by name, each with the id of a geom.
+        plane: the axes of the world that the first two coordinates follow; none if they do not.
         derived: `Derived`.
         sensing: whether wrappers read MuJoCo's state for what they observe, and see it under noise.
         anew: whether a reset changes what the next one does to a wrapper: each episode takes a new instance.
@@ -200,6 +221,7 @@ class EnvironmentSpec:
     start_high: tuple[float, ...] = ()
     max_steps: int = 1
     islands: Mapping[str, int] = field(default_factory=dict)
+    plane: tuple[Axis, ...] = ()
     derived: Derived = "unknown"
     sensing: bool = False
     anew: bool = False

@@ -78,6 +78,9 @@ class EnvironmentTask(Task):
         if not self.abilities.arrival_ends:
             nodes = int((SAMPLES_OF_NODES / self.max_steps) ** (1 / self.chart.dimension))
             self.learning = replace(self.learning, cells=max(nodes, 2))
+        if specification.plane:
+            first, second = sorted(axis.number for axis in specification.plane)
+            self.plane = first, second
         self._set_scene(specification.tracked)
 
     def __reduce__(self) -> tuple[Callable[..., Task], tuple[Any, ...]]:
@@ -117,7 +120,8 @@ class EnvironmentTask(Task):
     def _widen_view(self) -> None:
         """Lets the free cameras see all of a chart in the plane."""
         shown, seen = self.model.stat, 1.2  # how much such a camera shows, as a share of the extent
-        low, high = np.array(self.chart.low[:2]), np.array(self.chart.high[:2])
+        ends = self.where(np.array([self.chart.low, self.chart.high]))
+        low, high = ends.min(axis=0), ends.max(axis=0)
         reach = shown.extent * seen / 2
         low = np.minimum(low, shown.center[:2] - reach)
         high = np.maximum(high, shown.center[:2] + reach)
@@ -138,13 +142,18 @@ class EnvironmentTask(Task):
 
     @property
     def _in_plane(self) -> bool:
-        """Whether the chart's first two coordinates are a place."""
-        return self.chart.dimension >= 2 and all(unit == "m" for unit in self.chart.units[:2])
+        """Whether the chart's first two coordinates are a place on the floor."""
+        return bool(self.specification.plane) and self.plane == (0, 1)
 
     @property
     def _turning(self) -> int | None:
         """The coordinate of the chart that turns freely; None if none does."""
-        return next((i for i, wraps in enumerate(self.chart.periodic) if wraps), None)
+        joints = [
+            c.joint if c.kind == "qpos" and c.axis is None else None
+            for c in self.specification.coordinates
+        ]
+        free = (i for i, j in enumerate(joints) if j is not None and not self.model.jnt_limited[j])
+        return next(free, None)
 
     @cached_property
     def code(self) -> str:
@@ -271,6 +280,11 @@ class EnvironmentTask(Task):
         raise BadInput(
             f"hardly a start of {self.name} is free of walls: name another chart, or its bounds"
         )
+
+    def where(self, measured: np.ndarray) -> np.ndarray:
+        axes = sorted(enumerate(self.specification.plane), key=lambda pair: pair[1].number)
+        z = self.z(measured)
+        return np.column_stack([axis.world(z[:, i]) for i, axis in axes]) if axes else z[:, :2]
 
     @property
     def obstacles(self) -> Mapping[str, int]:  # type: ignore[override]
