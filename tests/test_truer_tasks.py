@@ -9,14 +9,18 @@ import sys
 
 import numpy as np
 import pytest
+from planted import homing_policy
 from trapped_plants import CALM, MJCF, TASK, VELOCITY, vehicle
 
 import hyrl_mj
 from hyrl_mj import BadInput, HybridController, Noise, from_callable, get_task, simulate
+from hyrl_mj.judging import Game
+from hyrl_mj.policies import PolicyController
 from hyrl_mj.policies.external import read_agent
+from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.simulation import Recorded, Signal, judge_task, noise as noises, register_noise
 from hyrl_mj.simulation.real import fresh_model
-from hyrl_mj.tasks import Outcome, check_as_made, check_task, described_task
+from hyrl_mj.tasks import Outcome, check_as_made, check_task, checks, described_task, trial
 
 _, XML, PY, *_ = vehicle()
 NAMES = iter(range(1_000))
@@ -467,3 +471,73 @@ def test_what_closes_no_loop_is_refused(vehicle):
     flat = type("Flat", (), {"act": lambda self, measured: np.zeros(len(measured))})()
     with pytest.raises(BadInput, match=r"inputs of shape \(2,\) for 2 measurements: give \(2, 1\)"):
         simulate("vehicle", flat, [[0.0, 0.5], [0.0, 0.4]])
+
+
+# ---- what a chart in another order, a seam, a start between nodes and a memory of actuators change
+
+
+FLIPPED = """    def z(self, measured):
+        return measured[:, ::-1]
+    def with_z(self, measured, z):
+        return z[:, ::-1]
+"""
+
+
+def test_a_chart_in_another_order_than_the_measurement(tmp_path):
+    task = get_task(write(tmp_path, {"methods": FLIPPED}))
+    z = np.array([[1.0, 0.5]])
+    np.testing.assert_array_equal(task.at(z), [[0.5, 1.0]])
+
+
+def test_a_share_of_noise_that_another_column_has(tmp_path):
+    task = get_task(write(tmp_path, {"methods": FLIPPED}))
+    task.noisy = (0.5, 1.0)  # of a measurement that begins with y
+    measured = task.with_z(np.zeros((9, 2)), task.starts(9, np.random.default_rng(0)))
+    with pytest.raises(BadInput, match="moves the chart's x by 1, and its share in noisy is 0.5"):
+        checks._check_noise_of_chart(task, measured)
+    task.noisy = (1.0, 1.0)
+    checks._check_noise_of_chart(task, measured)
+
+
+def test_a_box_of_starts_across_the_seam(circle):
+    task = copy.copy(circle)
+    task.start_low, task.start_high = (2.8,), (3.5,)
+    inside = task.may_start(np.array([[2.8], [3.37], [3.37 - 2 * np.pi], [2.7], [-2.7], [0.0]]))
+    np.testing.assert_array_equal(inside, [True, True, True, False, False, False])
+
+
+def test_a_start_between_two_nodes_counts(circle):
+    task = copy.copy(circle)
+    task.start_low = task.start_high = (3.0,)
+    grid = Grid(task.chart, (720,))
+    assert not task.may_start(grid.nodes).any()
+    sets = [GridSet(grid, side * grid.nodes[:, :1].sum(axis=1)) for side in (1, -1)]
+    game = Game(task, sets, {"policy": PolicyController(homing_policy(task))}, 0.05, grid=grid)
+    assert game.starts.sum() == 1
+    assert game.score("policy", 0.05).winnable == 1
+
+
+def test_who_looks_ahead_does_so_from_the_whole_state(tmp_path):
+    lagging = (
+        '<general name="u" joint="y" dyntype="filterexact" dynprm="0.3" gainprm="1e9" biastype="affine" '
+        'biasprm="0 0 -1e9" ctrlrange="-1 1"/>'
+    )
+    ahead = VELOCITY.format(name="ahead", joint="x", kv=1e9, more="")
+    task = get_task(write(tmp_path, actuators=ahead + lagging))
+    plant, copies = task.plant(1), task.plant(2)
+    plant.set_state(*task.state(np.array([[0.0, 0.3]])))
+    for _ in range(5):
+        plant.step(np.array([[1.0]]))
+    copies.resume(plant.state, np.array([1]))
+    for robots, ids in ((plant, [0]), (copies, [1])):
+        robots.step(np.array([[0.0]]), np.array(ids))
+    np.testing.assert_array_equal(plant.measurement[0], copies.measurement[1])
+    assert abs(plant.qvel[0, 1]) > 0.1, "the filter has not forgotten the inputs before"
+
+
+def test_a_point_off_the_robot_is_no_place_of_it(tmp_path):
+    moved = get_task(
+        write(tmp_path, text=lambda xml: xml.replace("<body", '<body pos="0.9 0 0"', 1))
+    )
+    with pytest.raises(BadInput, match="these are not the place of tracked"):
+        trial.try_place(moved)
