@@ -297,12 +297,13 @@ def _extent(instance: Instance, geoms: Sequence[int], axis: Axis) -> tuple[float
 
 
 def _turns_alike(instance: Instance, c: Coordinate, begun: np.ndarray) -> bool:
-    """Returns whether a whole turn of a coordinate changes nothing of what is seen, after steps, too."""
+    """Returns whether whole turns of a coordinate change nothing of what is seen, after steps, too."""
     spec, rng = instance.spec, np.random.default_rng(0)
     i = spec.coordinates.index(c)
+    turns = 2 * np.pi * np.array([0, *(sign * 2**k for k in range(7) for sign in (1, -1))])
     for z in begun[:4]:
         inputs, seen = [instance.drawn(rng)] * 4, []
-        for turn in (0.0, 2 * np.pi, -2 * np.pi):
+        for turn in turns:
             start = spec.state_at((z + turn * (np.arange(len(z)) == i))[None])[0]
             runs = instance.play(start, inputs, np.zeros((len(inputs) + 1, len(z))))
             seen.append(np.concatenate([np.append(one.observation, one.report) for one in runs]))
