@@ -57,12 +57,14 @@ def mode_ground(
     if states.rewarded:
         judge, parts = ByShare(states, settings), None
     elif task.effort.attacked:
-        judge = ByAttack(Attacked(Episodes(states, settings), attacks), settings, policy)
+        judge = ByAttack(
+            Attacked(Episodes(states, settings), attacks, meeting=True), settings, policy
+        )
     elif game.Lattice.decides(task, states.grid):
         judge = ByGame(states, settings)
     else:
         episodes = Episodes(states, settings)
-        attacked = Attacked(episodes, attacks)
+        attacked = Attacked(episodes, attacks, meeting=False)
         judge = ByEpisodes(episodes, settings, policy, attacked=attacked)
     part = None if parts is None else parts.parts[parts.modes.index(mode)]
     return ModeGround(states, judge, part, settings)

@@ -208,22 +208,26 @@ class Attacked:
 
     What is reported comes from the attack of the examination: other starts, another seed, more rounds.
 
+    Args:
+        episodes: the episodes.
+        attacks: what signals are tried.
+        meeting: whether half of the starts are where modes meet, where a mode may have to go against its
+            neighbours. A robot with speed of its own cannot begin at rest everywhere there.
+
     Attributes:
-        starts: (n, d) starts of the attack. Half of them are where modes meet: there a mode may have to go
-            against its neighbours.
+        starts: (n, d) starts of the attack, the others of which are those of episodes.
     """
 
-    def __init__(self, episodes: Episodes, attacks: AttackSettings):
+    def __init__(self, episodes: Episodes, attacks: AttackSettings, meeting: bool):
         self.episodes, self.attacks, states = episodes, attacks, episodes.states
         task, grid = states.task, states.grid
         off = distance_to(task.chart, states.extended.points, grid.nodes[states.nodes])
         near = states.nodes[off <= 2 * float(np.linalg.norm(states.bound / task.chart.scale))]
-        half = ATTACKED // 2 if len(near) else 0
+        half = ATTACKED // 2 if meeting and len(near) else 0
         self.starts = episodes.starts[: ATTACKED - half]
         if half:
             rng = np.random.default_rng(1)
-            meeting = grid.around(rng.choice(near, half), rng)
-            self.starts = np.vstack([self.starts, meeting])
+            self.starts = np.vstack([self.starts, grid.around(rng.choice(near, half), rng)])
 
     def lost(self, policy: Policy) -> np.ndarray:
         """Returns whether a policy loses from the starts (n,), without noise or under a signal."""
