@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -221,7 +220,7 @@ def robustness(run: Run, options: ExamineOptions) -> None:
         option = "--noise" if options.noise else "--near-critical"
         raise BadInput(f"{option} is about the episodes: say how many, as in --episodes 100000")
     pipeline.examine_run(run, options)
-    print_robustness(replace(run))
+    print_robustness(run.anew())
     if run.why_no_game is None:
         print(f"pictures in {run.path / 'figures'}")
 

@@ -324,8 +324,8 @@ def as_stage(run: Run, name: str, work: Callable[[Run], object]) -> Run:
     Raises:
         BadInput: another process works on the run directory.
     """
-    fresh = replace(run)  # it reads every file anew, so that the manifest records what was read
+    fresh = run.anew()  # so that the manifest records what was read
     # The physics uses all cores: BLAS threads would only wait for them.
     with threadpool_limits(1, user_api="blas"), fresh.manifest.stage(name):
         work(fresh)
-    return replace(run)
+    return run.anew()

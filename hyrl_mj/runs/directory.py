@@ -77,6 +77,12 @@ class Run:
         self.settings.check(task)
         return task
 
+    def anew(self) -> Run:
+        """Returns this run, which has read no file yet; its task, about which much is known, is the same."""
+        run = replace(self)
+        vars(run)["task"] = self.task
+        return run
+
     @cached_property
     def manifest(self) -> Manifest:
         """The record of the stages that are finished.
