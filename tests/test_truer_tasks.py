@@ -542,3 +542,17 @@ def test_a_point_off_the_robot_is_no_place_of_it(tmp_path):
     )
     with pytest.raises(BadInput, match="these are not the place of tracked"):
         trial.try_place(moved)
+
+
+def test_noise_that_mujoco_adds_nowhere_is_refused(tmp_path):
+    def text(xml):
+        return xml.replace('<jointpos joint="x"/>', '<jointpos joint="x" noise="0.05"/>')
+
+    with pytest.raises(BadInput, match=r"has noise=0\.05, which MuJoCo adds nowhere"):
+        check_task(get_task(write(tmp_path, text=text)))
+
+
+def test_a_plane_is_passed_on_no_side(tmp_path):
+    plane = '<worldbody><geom name="obstacle_floor" type="plane" size="9 9 1" contype="0" conaffinity="0"/>'
+    task = get_task(write(tmp_path, text=lambda xml: xml.replace("<worldbody>", plane)))
+    assert "floor" not in task.obstacles

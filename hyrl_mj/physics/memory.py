@@ -88,7 +88,7 @@ def keyed_mocap(model: mujoco.MjModel) -> str:
 
 
 def late_sensor(model: mujoco.MjModel) -> str:
-    """Returns which sensor holds or delays its values, and the remedy, as a sentence; "" if none does."""
+    """Returns which sensor holds or delays its values or has noise, and the remedy; "" if none does."""
     for i, name in enumerate(mjcf.names(model, mujoco.mjtObj.mjOBJ_SENSOR)):
         period, delay = float(model.sensor_interval[i].max()), float(model.sensor_delay[i])
         if period > 0 or delay > 0:
@@ -96,6 +96,11 @@ def late_sensor(model: mujoco.MjModel) -> str:
             return (
                 f"sensor {name} of {mjcf.model_name(model)} {does}, and the true state is taken from the "
                 "sensors: leave out its interval and delay"
+            )
+        if noise := float(model.sensor_noise[i]):
+            return (
+                f"sensor {name} of {mjcf.model_name(model)} has noise={noise:g}, which MuJoCo adds nowhere: "
+                f"leave it out, and say in the task what its sensors do, as sensor = 'gaussian {3 * noise:g}'"
             )
     return ""
 

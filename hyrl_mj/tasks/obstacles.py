@@ -18,14 +18,16 @@ SIDES = ("left", "right")
 def islands(model: mujoco.MjModel) -> dict[str, int]:
     """Returns the obstacles by name, each with the id of a geom that stands for it.
 
-    These are the geoms whose names begin with "obstacle". Those that touch each other, as the walls of a
-    maze, are one obstacle, of the name of the first. The name is what follows "obstacle".
+    These are the geoms whose names begin with "obstacle", but no planes, which nothing passes. Those that
+    touch each other, as the walls of a maze, are one obstacle, of the name of the first. The name is what
+    follows "obstacle".
 
     Raises:
         BadInput: there are more than `MOST_OBSTACLES`.
     """
     geoms = mjcf.obstacles(model)
     ids = [mjcf.object_id(model, mujoco.mjtObj.mjOBJ_GEOM, name) for name in geoms]
+    ids = [i for i in ids if model.geom_type[i] != mujoco.mjtGeom.mjGEOM_PLANE]
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     kept = [group[0] for group in touching(model, data, ids)]
