@@ -4,39 +4,36 @@ from __future__ import annotations
 
 import json
 
+import mujoco
 import numpy as np
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.gym_import.coordinates import robot_of
 from hyrl_mj.gym_import.fingerprint import Fingerprint, differing
 from hyrl_mj.gym_import.instance import Instance
+from hyrl_mj.gym_import.starts import Resets, own_of
+from hyrl_mj.gym_import.trials import EPISODES, HELD, SAMPLES
 
-# Resets that are compared for all that they draw.
+# Resets whose runs are compared, beside those that bring rare values.
 COMPARED = 4
+# Of what resets draw of the robot: how much of what runs reach is wide, and by how much of it the ends of runs
+# may differ.
+WIDE, APART = 1 / 3, 0.15
 
 
-def states_of_resets(instance: Instance) -> np.ndarray:
-    """Returns MuJoCo's states (64, S) that resets lead to."""
-    found = []
-    for seed in range(64):
-        instance.reset(seed)
-        found.append(instance.physics.read())
-    return np.array(found)
-
-
-def check_draws(instance: Instance, states: np.ndarray) -> str:
+def check_draws(instance: Instance, resets: Resets, met: np.ndarray) -> str:
     """Returns what resets draw and how it is pinned, to be said to the user; "" if they draw nothing.
 
     Args:
         instance: the environment.
-        states: MuJoCo's states (n, S) after resets.
+        resets: what resets lead to.
+        met: MuJoCo's states (n, S) that sampled runs have met.
 
     Raises:
         BadInput: nothing pins what they draw, or what pins it changes nothing, or contradicts something else.
     """
     description, name = instance.spec.description, instance.name
     options, pinned, seed = description.reset, description.pinned, description.seed
-    names = _drawn(instance, states)
+    names = _drawn(instance, resets) + _of_robot(instance, resets.states, met)
     changed = _changed_by_user(instance) if options or pinned else set()
     if options and not changed:
         draws = f", which draws {', '.join(names)}" if names else ""
@@ -69,21 +66,22 @@ def check_draws(instance: Instance, states: np.ndarray) -> str:
     )
 
 
-def _drawn(instance: Instance, states: np.ndarray) -> list[str]:
+def _drawn(instance: Instance, resets: Resets) -> list[str]:
     """Returns the names of what resets draw, beside the robot's own state, and what comes next depends on."""
-    model, columns = instance.model, instance.physics.columns
-    robot = robot_of(model, instance.spec.coordinates)
+    states = resets.states
     varies = np.ptp(states, axis=0) > 0
-    varies[columns["warmstart"]] = False  # it says nothing of where a run goes
-    body_of_qpos = np.repeat(model.jnt_bodyid, np.diff(np.append(model.jnt_qposadr, model.nq)))
-    for kind, bodies in (("qpos", body_of_qpos), ("qvel", model.dof_bodyid)):
-        varies[columns[kind][robot[bodies]]] = False
+    varies[instance.physics.columns["warmstart"]] = False  # it says nothing of where a run goes
+    varies[own_of(instance.spec, instance.model)] = False
     names = [name for name, v in zip(_names_of_state(instance), varies, strict=True) if v]
     again = [_begun(instance, states[:1], 0)[0] for _ in range(2)]
     lasting = set(differing(*again))  # what outlasts a reset is not drawn by it
     begun = [
-        _begun(Instance(instance.spec) if lasting else instance, states[:3], seed)
-        for seed in range(COMPARED)
+        _begun(
+            Instance(instance.spec) if lasting else instance,
+            states[: 3 if seed < COMPARED else 1],
+            seed,
+        )
+        for seed in resets.telling(COMPARED, lasting)
     ]
     if lasting:  # nothing has outlasted the first reset of a new instance
         lasting = set(differing(begun[0][0], _begun(Instance(instance.spec), states[:1], 0)[0]))
@@ -95,17 +93,71 @@ def _drawn(instance: Instance, states: np.ndarray) -> list[str]:
     sizes = np.abs(told[np.isfinite(told)])
     most = 1e-9 * max(float(sizes.max(initial=0.0)), 1.0)
     if all(
-        other.shape == told.shape and np.allclose(other, told, rtol=0, atol=most, equal_nan=True)
-        for _, other in begun
+        np.array_equal(other.shape, told.shape if i < COMPARED else other.shape)
+        and np.allclose(other, told[: len(other)], rtol=0, atol=most, equal_nan=True)
+        for i, (_, other) in enumerate(begun)
     ):
         if differ:
-            instance.spec.found["kept"] = (
+            _keep(
+                instance,
                 f"{', '.join(differ[:8])}, as the reset that runs begin with leaves it; no trial shows that "
-                "what is to be done depends on it"
+                "what is to be done depends on it",
             )
         return names + of_model
     goals = [name for name in differ if any(word in name for word in ("goal", "target", "task"))]
     return names + of_model + (goals or differ) or ["something that no attribute holds"]
+
+
+def _keep(instance: Instance, what: str) -> None:
+    """Adds to what is said of what stays as a reset leaves it."""
+    found = instance.spec.found
+    found["kept"] = "; ".join(filter(None, (found.get("kept"), what)))
+
+
+def _of_robot(instance: Instance, states: np.ndarray, met: np.ndarray) -> list[str]:
+    """Returns the names of what resets draw of the robot outside of the chart, if runs depend on it much.
+
+    Runs are played from states that resets lead to, and from the same places with all that is not of the chart
+    as runs begin.
+    """
+    spec, physics = instance.spec, instance.physics
+    own = own_of(spec, instance.model)
+    own = own[(np.ptp(states[:, own], axis=0) > 0) & ~np.isin(own, spec.places)]
+    if not len(own):
+        return []
+    reach = np.ptp(np.vstack([met, states]), axis=0)
+    turns = [i for i in spec.qpos if i in own and _turns(instance, i - spec.qpos[0])]
+    reach[turns] = np.minimum(reach[turns], 2 * np.pi)
+    usual = states[0].copy()
+    usual[spec.qvel[np.isin(spec.qvel, own)]] = 0.0
+    depends = bool((np.ptp(states, axis=0)[own] > WIDE * reach[own]).any())
+    for seed, state in enumerate(states[:: len(states) // EPISODES]):
+        ends = []
+        if depends:
+            break
+        for values in (state, usual):
+            start, rng = state.copy(), np.random.default_rng(seed)
+            start[own] = values[own]
+            instance.put(start)
+            results = [*instance.wander(rng, SAMPLES, HELD)]
+            ends.append((len(results), physics.read()[spec.places]))
+        (k, here), (n, there) = ends
+        depends = k != n or bool((np.abs(here - there) > APART * reach[spec.places]).any())
+    names = [_names_of_state(instance)[i] for i in own]
+    if depends:
+        return names
+    _keep(
+        instance,
+        f"{', '.join(names[:8])} of the robot, which resets draw, as the reset that runs begin with leaves it, "
+        f"velocities 0; over what they draw, no trial ends elsewhere by more than {APART:.0%} of what runs reach",
+    )
+    return []
+
+
+def _turns(instance: Instance, index: int) -> bool:
+    """Returns whether a position, by its index, is the angle of a hinge."""
+    model = instance.model
+    return int(index) in model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE]
 
 
 def _begun(instance: Instance, starts: np.ndarray, seed: int) -> tuple[Fingerprint, np.ndarray]:

@@ -19,7 +19,7 @@ from hyrl_mj.gym_import.coordinates import (
     coordinates,
     robot_of,
 )
-from hyrl_mj.gym_import.draws import check_draws, states_of_resets
+from hyrl_mj.gym_import.draws import check_draws
 from hyrl_mj.gym_import.expressions import Expression
 from hyrl_mj.gym_import.fingerprint import codes_of, differing, is_known
 from hyrl_mj.gym_import.instance import Instance
@@ -27,7 +27,8 @@ from hyrl_mj.gym_import.observations import parts_of
 from hyrl_mj.gym_import.opening import FORMS, AnyChart, Description, layers
 from hyrl_mj.gym_import.pool import Pool
 from hyrl_mj.gym_import.specification import Criterion
-from hyrl_mj.gym_import.uses import changes_by_reset, check_noted, check_told, check_use, senses
+from hyrl_mj.gym_import.starts import check_noted, resets_of
+from hyrl_mj.gym_import.uses import changes_by_reset, check_told, check_use, senses
 from hyrl_mj.physics import mjcf
 from hyrl_mj.sets import Chart
 
@@ -64,15 +65,15 @@ def inspect(description: Description, untried: bool = False) -> tuple[Pool, Inst
     _learn_coordinates(instance)
     states, info = _sampled(instance)
     instance.learn(criterion=_criterion(instance, info))
-    begun = states_of_resets(instance)
-    if draws := check_draws(instance, begun):
+    resets = resets_of(instance)
+    if draws := check_draws(instance, resets, states):
         instance.spec.found["goal"] = draws
     instance = Instance(instance.spec)  # something may have outlasted the resets of the other
     instance.learn(state=_at_rest(instance))
-    _learn_bounds(instance, instance.spec.z(states), instance.spec.z(begun))
+    _learn_bounds(instance, instance.spec.z(states), instance.spec.z(resets.states))
     trials.check_observer(instance)
     check_use(instance.spec)
-    check_noted(instance.spec)
+    check_noted(instance.spec, resets)
     derived, late = trials.derived_of(instance)
     if late:
         instance.spec.found["lag"] = f"observation {', '.join(map(str, late))} {LAG[derived]}"

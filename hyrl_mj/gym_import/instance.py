@@ -55,6 +55,7 @@ class Instance:
         start: the state of MuJoCo to which the innermost reset has to lead, below wrappers.
         tamper: changes, in a trial, all but the observation before wrappers get it; these may then write to a
             state that noise has moved, too.
+        noted: changes, in a trial, what resets note.
 
     Raises:
         BadInput: it cannot be made or reset.
@@ -84,6 +85,7 @@ class Instance:
         self._samples = 0
         self._pairs: list[tuple[np.ndarray, np.ndarray]] = []
         self.tamper: Callable[[tuple[Any, ...]], tuple[Any, ...]] | None = None
+        self.noted: Callable[[], None] | None = None
         if self.is_wrapped:
             self._put_in()
 
@@ -176,7 +178,11 @@ class Instance:
             seed: of the reset, by default the one that all runs begin from.
         """
         yield Seen(start, self.put(start, seed, noises[0]), ())
-        for u, noise in zip(inputs, noises[1:], strict=True):
+        yield from self.goes_on(inputs, noises[1:])
+
+    def goes_on(self, inputs: Iterable[np.ndarray], noises: np.ndarray) -> Iterator[Seen]:
+        """Yields what is seen after each sample from where it is; as `play`, with noises (k, d)."""
+        for u, noise in zip(inputs, noises, strict=True):
             self.act(u)
             state = self.physics.read()  # as the environment itself has left it
             self.sense(noise)
@@ -192,6 +198,8 @@ class Instance:
         if pinned := self.spec.description.pinned:
             set_pins(self.inner, self.data, pinned, self.name)
             self.physics.write(self.physics.read())
+        if self.noted is not None:
+            self.noted()
 
     def memory(self) -> written.Fingerprint:
         """Returns what it remembers now outside of its state in MuJoCo: attributes, and MuJoCo's model."""

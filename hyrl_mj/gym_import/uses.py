@@ -9,11 +9,9 @@ from __future__ import annotations
 import copy
 from collections import deque
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from hyrl_mj.errors import BadInput
@@ -132,60 +130,6 @@ def _holds(given: list[np.ndarray], seen: np.ndarray) -> bool:
     return any(np.array_equal(one, seen, equal_nan=True) for one in given)
 
 
-def check_noted(spec: EnvironmentSpec) -> None:
-    """Raises `BadInput` if runs from a start on the chart depend on the place that the reset before noted.
-
-    They are played after the reset as it is, and after one that leads to the start itself, because what it
-    computes with mj_forward is computed there. Both have to go alike, to their ends and under inputs that do
-    not change, which lead far away.
-    """
-    if spec.description.starts == "reset":
-        return
-    rng, usual, led = np.random.default_rng(11), Instance(spec), Instance(spec)
-    none = np.zeros((spec.max_steps + 1, spec.dimension))
-    first = 0 if "reward" in spec.criterion.asked else 1  # of the report, by which it is judged
-    for state in spec.state_at(spec.anywhere(rng, EPISODES)):
-        inputs = [usual.drawn(rng)] * spec.max_steps
-        ours, theirs = (one.play(state, inputs, none) for one in (usual, led))
-        next(ours)
-        with _leading(led, state):
-            next(theirs)
-        noted = differing(led.memory(), usual.memory())
-        if not noted:
-            return
-        if usual.physics.depth(spec.solid) > spec.depth:
-            continue
-        for pair in zip(ours, theirs, strict=True):
-            a, b = (np.concatenate([*seen[:2], seen.report[first:]]) for seen in pair)
-            if not np.array_equal(a, b, equal_nan=True):
-                raise BadInput(
-                    f"reset() of {spec.name} notes where it leads to ({noted[0]}), and step() goes by that, "
-                    "so a start elsewhere on the chart is none of its own: let the first step() note it, or "
-                    "give starts='reset'"
-                )
-            if any(pair[0].report[1:3]):
-                break
-
-
-@contextmanager
-def _leading(instance: Instance, state: np.ndarray) -> Iterator[None]:
-    """Has mj_forward first put an environment to the chart's place in a state (S,)."""
-    own, places = mujoco.mj_forward, instance.spec.places
-
-    def forward(model: Any, data: Any) -> None:
-        if data is instance.data:
-            moved = instance.physics.read()
-            moved[places] = state[places]
-            instance.physics.show(moved)
-        own(model, data)
-
-    mujoco.mj_forward = forward
-    try:
-        yield
-    finally:
-        mujoco.mj_forward = own
-
-
 # ---- wrappers
 
 
@@ -292,9 +236,9 @@ def _run(
     def tamper(rest: tuple[Any, ...]) -> tuple[Any, ...]:
         new = {} if changes is None else changes[len(told)]
         info = dict(rest[-1])
-        held = _held(instance.inner, info)
+        held = held(instance.inner, info)
         told.append({name: copy.deepcopy(owner[key]) for name, owner, key in held})
-        for name, owner, key in [*_held(instance.inner, info)] if new else ():
+        for name, owner, key in [*held(instance.inner, info)] if new else ():
             if name in new:
                 owner[key] = copy.deepcopy(new[name])
         return (*rest[:-1], info)
@@ -307,7 +251,7 @@ def _run(
     return found
 
 
-def _held(inner: Any, info: dict[str, Any]) -> Iterator[tuple[str, Any, Any]]:
+def held(inner: Any, info: dict[str, Any]) -> Iterator[tuple[str, Any, Any]]:
     """Yields name, owner and key of all numbers in `info` and in attributes, also within objects."""
     seen = {id(inner)}
     for kind, owner in (("info", info), ("attribute", getattr(inner, "__dict__", {}))):
@@ -317,7 +261,7 @@ def _held(inner: Any, info: dict[str, Any]) -> Iterator[tuple[str, Any, Any]]:
 def _within(owner: Any, path: str, seen: set[int], depth: int) -> Iterator[tuple[str, Any, Any]]:
     """Yields names, owners and keys of the numbers in a dictionary or a list, and in what it holds."""
     for key, value in [*owner.items()] if isinstance(owner, dict) else [*enumerate(owner)]:
-        if _numbers(value) is not None:
+        if numbers_of(value) is not None:
             yield f"{path}{key}", owner, key
         elif depth < DEEPEST and id(value) not in seen:
             seen.add(id(value))
@@ -330,12 +274,12 @@ def _within(owner: Any, path: str, seen: set[int], depth: int) -> Iterator[tuple
             yield from _within(parts, f"{path}{key}.", seen, depth + 1)
 
 
-def _numbers(value: Any) -> np.ndarray | None:
+def numbers_of(value: Any) -> np.ndarray | None:
     """Returns the numbers (k,) that a value is, or all parts of a collection are; None if it holds others."""
     if isinstance(value, dict):
         value = [*value.values()]
     if isinstance(value, list | tuple | deque):
-        parts = [_numbers(part) for part in value]
+        parts = [numbers_of(part) for part in value]
         numbers = [part for part in parts if part is not None]
         return np.concatenate(numbers) if 0 < len(numbers) == len(parts) else None
     if not isinstance(value, int | float | np.number | np.ndarray):
@@ -346,7 +290,7 @@ def _numbers(value: Any) -> np.ndarray | None:
 
 def _far(here: Any, there: Any, least: float) -> bool:
     """Returns whether what is told at two places differs by as much as what follows the place does."""
-    a, b = _numbers(here), _numbers(there)
+    a, b = numbers_of(here), numbers_of(there)
     if a is None or b is None or len(a) != len(b):
         return False
     return bool(np.abs(a - b).max(initial=0.0) >= least)

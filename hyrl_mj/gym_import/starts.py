@@ -1,0 +1,454 @@
+"""What resets lead to, and whether a start elsewhere on the chart is as one that a reset would lead to.
+
+A run begins after the reset with the seed, and at its own place on the chart. All else stays as that reset
+left it. What a reset sets to the place of the robot would be elsewhere: a setpoint, a place that it notes, a
+load that is tied to the robot.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from hyrl_mj.errors import BadInput
+from hyrl_mj.gym_import.coordinates import robot_of
+from hyrl_mj.gym_import.fingerprint import differing
+from hyrl_mj.gym_import.instance import Instance
+from hyrl_mj.gym_import.specification import EnvironmentSpec
+from hyrl_mj.gym_import.trials import EPISODES
+from hyrl_mj.gym_import.uses import held, numbers_of
+
+# Resets that are looked at, and values of what they leave behind that are told apart.
+RESETS, VALUES = 64, 8
+# What is added to names of parts of the model.
+OF_MODEL = " of its model"
+# Samples of a run from the start of a reset, and by how much it may differ from a run that is put there, as a
+# share of its numbers: rounding.
+NATURAL, SAME = 100, 1e-6
+# By how much equality constraints may be violated more than after resets [m, rad].
+VIOLATED = 1e-3
+
+
+@dataclass(frozen=True)
+class Resets:
+    """What the resets with the seeds 0 to 63 lead to.
+
+    Attributes:
+        states: MuJoCo's states (64, S).
+        differ: the names of what is remembered otherwise than after the first reset, each with the seeds that
+            bring a value for the first time, `VALUES` at most.
+        numbers: (64, k) of the attributes and parts of the model that differ and are numbers, by name.
+        violation: by how much they violate equality constraints at most [m, rad].
+    """
+
+    states: np.ndarray
+    differ: dict[str, list[int]]
+    numbers: dict[str, np.ndarray]
+    violation: float
+
+    def telling(self, first: int, lasting: set[str]) -> list[int]:
+        """Returns the first so many seeds, and those with other, the least and the greatest values.
+
+        What is not drawn, but outlasts resets, is told by its names.
+        """
+        found = dict.fromkeys(range(first))
+        for name, seeds in self.differ.items():
+            if name in lasting:
+                continue
+            if len(seeds) < VALUES:
+                found |= dict.fromkeys(seeds)
+            elif name in self.numbers:
+                column = self.numbers[name][:, np.ptp(self.numbers[name], axis=0).argmax()]
+                found |= dict.fromkeys((int(column.argmin()), int(column.argmax())))
+        return list(found)[:20]
+
+
+def resets_of(instance: Instance) -> Resets:
+    """Returns what resets lead to."""
+    states, differ, violation = [], dict[str, list[int]](), 0.0
+    values, numbers = dict[str, list[Any]](), dict[str, dict[int, np.ndarray]]()
+    first = None
+    for seed in range(RESETS):
+        instance.reset(seed)
+        states.append(instance.physics.read())
+        violation = max(violation, _violation(instance))
+        memory = instance.memory()
+        first = first or memory
+        for name in differing(first, memory):
+            known = values.setdefault(name, [first.get(name)])
+            if len(known) <= VALUES and memory.get(name) not in known:
+                known.append(memory.get(name))
+                differ.setdefault(name, []).append(seed)
+            if name.endswith(OF_MODEL) and name != f"opt{OF_MODEL}":
+                part = getattr(instance.model, name.removesuffix(OF_MODEL))
+                usual = np.frombuffer(first[name], part.dtype).astype(float)
+                of_part = numbers.setdefault(name, dict.fromkeys(range(RESETS), usual))
+                of_part[seed] = part.ravel().astype(float)
+        for name, owner, key in held(instance.inner, {}):
+            numbers.setdefault(name.removeprefix("attribute "), {})[seed] = numbers_of(owner[key])
+    tables = {
+        name: np.array([*rows.values()])
+        for name, rows in numbers.items()
+        if len(rows) == RESETS and len({len(row) for row in rows.values()}) == 1
+    }
+    tables = {name: table for name, table in tables.items() if (table != table[0]).any()}
+    return Resets(np.array(states), differ, tables, violation)
+
+
+def _violation(instance: Instance) -> float:
+    """Returns by how much equality constraints are violated at most [m, rad]."""
+    data = instance.data
+    of_equality = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
+    return float(np.abs(data.efc_pos[of_equality]).max(initial=0.0))
+
+
+def own_of(spec: EnvironmentSpec, model: mujoco.MjModel) -> np.ndarray:
+    """Returns the places of the robot's positions and velocities in a state of MuJoCo."""
+    robot = robot_of(model, spec.coordinates)
+    body_of_qpos = np.repeat(model.jnt_bodyid, np.diff(np.append(model.jnt_qposadr, model.nq)))
+    return np.append(spec.qpos[robot[body_of_qpos]], spec.qvel[robot[model.dof_bodyid]])
+
+
+# ---- what follows the place
+
+
+def _terms(spec: EnvironmentSpec, model: mujoco.MjModel, states: np.ndarray) -> np.ndarray:
+    """Returns the terms (n, t) of which what follows from the place of the robot is a sum, of states (n, S)."""
+    z = spec.z(states)
+    own = [i for i in own_of(spec, model) if i in spec.qpos and i not in spec.places]
+    turns = [i for i, c in enumerate(spec.coordinates) if c.unit == "rad"]
+    waves = [wave(z[:, i]) for i in turns for wave in (np.sin, np.cos)]
+    products = [a * b for a, b in combinations(waves, 2)]
+    others = [states[:, own]] if len(own) < RESETS // 2 else []
+    return np.column_stack([np.ones(len(z)), z, (z**2).sum(axis=1), *waves, *products, *others])
+
+
+Predict = Callable[[np.ndarray], np.ndarray]
+
+
+def _predicted(terms: np.ndarray, table: np.ndarray) -> Predict | None:
+    """Returns what gives the columns of a table (n, k) from terms (t,), where these tell some that vary.
+
+    A column, or its square as of a distance, may be a sum of the terms; the others stay as in the first row.
+    """
+    varies = np.ptp(table, axis=0) > 1e-9
+    plain, square = (np.linalg.lstsq(terms, t, rcond=None)[0] for t in (table, table**2))
+
+    def exact(fit: np.ndarray, values: np.ndarray) -> np.ndarray:
+        off = np.abs(terms @ fit - values).max(axis=0)
+        return varies & (off <= 1e-6 * np.maximum(np.ptp(values, axis=0), 1e-9))
+
+    is_plain = exact(plain, table)
+    is_square = exact(square, table**2) & ~is_plain & (table >= 0).all(axis=0)
+    if not (is_plain | is_square).any():
+        return None
+
+    def predict(of: np.ndarray) -> np.ndarray:
+        root = np.sqrt(np.maximum(of @ square, 0))
+        return np.where(is_plain, of @ plain, np.where(is_square, root, table[0]))
+
+    return predict
+
+
+def _setpoints(instance: Instance, state: np.ndarray, now: np.ndarray) -> np.ndarray:
+    """Returns a state (S,) with setpoints that pull as little as those of another one: its own, moved along.
+
+    They are those of actuators that pull the more the farther away they are from their setpoints, in `ctrl`
+    or `act`.
+    """
+    model, data, physics = instance.model, instance.data, instance.physics
+    lengths = []
+    for one in (state, now):
+        physics.write(one)
+        lengths.append(data.actuator_length.copy())
+    moved = now.copy()
+    for i in range(model.nu):
+        gain, bias = model.actuator_gainprm[i, 0], model.actuator_biasprm[i, 1]
+        if model.actuator_biastype[i] and bias and gain:
+            by = -bias / gain * (lengths[1][i] - lengths[0][i])
+            at = model.actuator_actadr[i]
+            has_act = model.actuator_dyntype[i] and at >= 0
+            column = physics.columns["act"][at] if has_act else physics.columns["ctrl"][i]
+            moved[column] += by
+    return moved
+
+
+def _equal_to(place: np.ndarray, table: np.ndarray) -> Callable[[np.ndarray], np.ndarray] | None:
+    """Returns what puts another place (d,) where numbers (k,) hold a place; None if they do not.
+
+    Whole numbers that stand alone may be anything else, and so may zeros.
+    """
+    d, at = len(place), []
+    if place.any() and (d > 1 or not float(place[0] * 2).is_integer()):
+        at = [i for i in range(len(table) - d + 1) if np.array_equal(table[i : i + d], place)]
+    if not at:
+        return None
+
+    def put(other: np.ndarray) -> np.ndarray:
+        found = table.copy()
+        for i in at:
+            found[i : i + d] = other
+        return found
+
+    return put
+
+
+# ---- the trials
+
+
+def check_noted(spec: EnvironmentSpec, resets: Resets) -> None:
+    """Raises `BadInput` if a run from a start on the chart is not as a reset to there would have it go.
+
+    Runs are played after the reset as it is, and where what follows the place has been moved along. Both have
+    to go alike, to their ends and under inputs that do not change, which lead far away.
+    """
+    _check_equalities(spec, resets)
+    _check_following(spec, resets)
+    _check_led(spec)
+    drawn = np.ptp(spec.z(resets.states), axis=0).any()
+    if drawn and "goal" not in spec.found:
+        _check_natural(spec, resets)
+
+
+def _starts(spec: EnvironmentSpec, rng: np.random.Generator) -> np.ndarray:
+    return spec.state_at(spec.anywhere(rng, EPISODES))
+
+
+def _check_equalities(spec: EnvironmentSpec, resets: Resets) -> None:
+    instance = Instance(spec)
+    if not instance.model.neq:
+        return
+    for state in _starts(spec, np.random.default_rng(11)):
+        instance.put(state)
+        if (off := _violation(instance)) > VIOLATED + 2 * resets.violation:
+            raise BadInput(
+                f"equality constraints tie the robot of {spec.name} to something that stays where its reset "
+                f"leads to: at another start on the chart they are off by {off:.3g} m or rad. Leave them out, "
+                "or name a chart of what they tie together"
+            )
+
+
+def _check_following(spec: EnvironmentSpec, resets: Resets) -> None:
+    """Raises `BadInput` if runs depend on what follows the place over resets, and is not at the start's."""
+    rng, usual, other = np.random.default_rng(11), Instance(spec), Instance(spec)
+    model, states = usual.model, resets.states
+    drawn = bool(np.ptp(spec.z(states), axis=0).any())
+    terms = _terms(spec, model, states)
+    columns = usual.physics.columns
+    passed = {*columns["time"], *columns["warmstart"], *own_of(spec, model)}
+    free = np.array([i for i in range(states.shape[1]) if i not in passed], dtype=int)
+    names = [f"{kind}[{i}]" for kind, at in columns.items() for i in range(len(at))]
+    of_state = _predicted(terms, states[:, free]) if drawn else None
+    of_memory: dict[str, Predict] = {}
+    if drawn:
+        for name, table in resets.numbers.items():
+            if np.isfinite(table).all() and (predict := _predicted(terms, table)) is not None:
+                of_memory[name] = predict
+    else:
+        usual.reset()
+        place = spec.state[spec.places]
+        for name, owner, key in held(usual.inner, {}):
+            if (put := _equal_to(place, numbers_of(owner[key]))) is not None:
+                of_memory[name.removeprefix("attribute ")] = put
+    reach = _terms(spec, model, _starts(spec, rng))
+    for state in _starts(spec, rng):
+        here = _terms(spec, model, state[None])[0] if drawn else state[spec.places]
+        moved = state.copy()
+        if of_state is not None:
+            now = of_state(here)
+            changes = np.abs(now - state[free]) > 1e-9 * np.maximum(np.abs(now), 1.0)
+            moved[free[changes]] = now[changes]
+        elif not drawn:
+            usual.reset()
+            moved = _setpoints(usual, spec.state, state)
+        what = [names[i] for i in np.flatnonzero(moved != state)]
+        if not what and not of_memory:
+            return
+        inputs = [usual.drawn(rng)] * spec.max_steps
+        values = {name: predict(here) for name, predict in of_memory.items()}
+        trials = [(moved, values, inputs)]
+        if of_memory:  # so far that limits on it show
+            at = reach if drawn else _starts(spec, rng)[:, spec.places]
+            far = {n: 3 * np.ptp([p(t) for t in at], axis=0) for n, p in of_memory.items()}
+            for sign in (1, -1):
+                changed = {n: values[n] + sign * far[n] for n in values}
+                trials.append((state, changed, inputs[:NATURAL]))
+        for start, noted, of_run in trials:
+            _compare_noted(usual, other, (state, start), noted, of_run, [*of_memory, *what])
+
+
+def _compare_noted(
+    usual: Instance,
+    other: Instance,
+    starts: tuple[np.ndarray, np.ndarray],
+    noted: dict[str, np.ndarray],
+    inputs: list[np.ndarray],
+    what: list[str],
+) -> None:
+    """Raises `BadInput` if a run goes otherwise where what a reset noted is set to other values, by name."""
+    spec = usual.spec
+    none = np.zeros((len(inputs) + 1, spec.dimension))
+    other.noted = lambda: _set(other, noted)
+    ours, theirs = usual.play(starts[0], inputs, none), other.play(starts[1], inputs, none)
+    k, differs = 0, False
+    for k, pair in enumerate(_both(ours, theirs)):  # noqa: B007
+        if pair is None:
+            differs = True
+            break
+        if not k and usual.physics.depth(spec.solid) > spec.depth:
+            return
+        # The first reward after a start is of what shapes it, and it alone is not judged by.
+        first = 0 if "reward" in spec.criterion.asked or k > 1 else 1
+        a, b = (np.concatenate([spec.z(s.state[None])[0], s.observation, s.report[first:]]) for s in pair)
+        if differs := not np.array_equal(a, b, equal_nan=True):
+            break
+        if any(pair[0].report[1:3]):
+            break
+    if differs:
+        raise _not_its_own(spec, what)
+
+
+def _set(instance: Instance, noted: dict[str, np.ndarray]) -> None:
+    """Sets attributes and parts of the model to numbers (k,), by name."""
+    for name, owner, key in [*held(instance.inner, {})]:
+        if (numbers := noted.get(name.removeprefix("attribute "))) is not None:
+            old = owner[key]
+            if isinstance(old, np.ndarray) and old.flags.writeable:
+                old[...] = numbers.reshape(old.shape)  # it may be known by several names
+            else:
+                owner[key] = _like(old, list(numbers))
+    for name in noted:
+        if name.endswith(OF_MODEL):
+            part = getattr(instance.model, name.removesuffix(OF_MODEL))
+            part[...] = noted[name].reshape(part.shape)
+
+
+def _like(old: Any, numbers: list[Any]) -> Any:
+    """Returns what has the form of a value, of numbers that are taken away."""
+    if isinstance(old, dict):
+        return {key: _like(part, numbers) for key, part in old.items()}
+    if isinstance(old, tuple) and hasattr(old, "_fields"):
+        return type(old)(*(_like(part, numbers) for part in old))
+    if isinstance(old, list | tuple | deque):
+        return type(old)(_like(part, numbers) for part in old)
+    if isinstance(old, np.ndarray):
+        return np.array([numbers.pop(0) for _ in range(old.size)], old.dtype).reshape(old.shape)
+    return type(old)(numbers.pop(0))
+
+
+def _both(ours: Iterator[Any], theirs: Iterator[Any]) -> Iterator[Any]:
+    """Yields pairs of samples; None where one of the runs fails at values that it does not know."""
+    while True:
+        try:
+            yield next(ours), next(theirs)
+        except StopIteration:
+            return
+        except BadInput:
+            yield None
+            return
+
+
+def _not_its_own(spec: EnvironmentSpec, what: list[str]) -> BadInput:
+    one_place = not any(b > a for a, b in zip(spec.start_low, spec.start_high, strict=True))
+    or_reset = "" if spec.description.starts == "reset" or one_place else " or give starts='reset'"
+    return BadInput(
+        f"reset() of {spec.name} notes where it leads to ({', '.join(what[:4])}), and step() goes by that, so "
+        f"a start elsewhere on the chart is none of its own: let the first step() note it,{or_reset} where "
+        "each reset leads to one place"
+    )
+
+
+def _check_led(spec: EnvironmentSpec) -> None:
+    """Raises `BadInput` if runs depend on what a reset computes with mj_forward of the place it leads to.
+
+    The other reset leads to the start itself.
+    """
+    rng, usual, led = np.random.default_rng(11), Instance(spec), Instance(spec)
+    none = np.zeros((spec.max_steps + 1, spec.dimension))
+    first = 0 if "reward" in spec.criterion.asked else 1  # of the report, by which it is judged
+    for state in _starts(spec, rng):
+        inputs = [usual.drawn(rng)] * spec.max_steps
+        ours, theirs = (one.play(state, inputs, none) for one in (usual, led))
+        next(ours)
+        with _leading(led, state):
+            next(theirs)
+        noted = differing(led.memory(), usual.memory())
+        if not noted:
+            return
+        if usual.physics.depth(spec.solid) > spec.depth:
+            continue
+        for pair in zip(ours, theirs, strict=True):
+            a, b = (np.concatenate([*seen[:2], seen.report[first:]]) for seen in pair)
+            if not np.array_equal(a, b, equal_nan=True):
+                raise _not_its_own(spec, noted[:1])
+            if any(pair[0].report[1:3]):
+                break
+
+
+@contextmanager
+def _leading(instance: Instance, state: np.ndarray) -> Iterator[None]:
+    """Has mj_forward first put an environment to the chart's place in a state (S,)."""
+    own, places = mujoco.mj_forward, instance.spec.places
+
+    def forward(model: Any, data: Any) -> None:
+        if data is instance.data:
+            moved = instance.physics.read()
+            moved[places] = state[places]
+            instance.physics.show(moved)
+        own(model, data)
+
+    mujoco.mj_forward = forward
+    try:
+        yield
+    finally:
+        mujoco.mj_forward = own
+
+
+def _check_natural(spec: EnvironmentSpec, resets: Resets) -> None:
+    """Raises `BadInput` if a run that a reset begins goes otherwise than one that is put to the same place.
+
+    The robot is put there as that reset left it, and all else is as the reset left it that runs begin with.
+    """
+    usual, rng = Instance(spec), np.random.default_rng(12)
+    own = np.append(own_of(spec, usual.model), usual.physics.columns["warmstart"])
+    n = min(NATURAL, spec.max_steps)
+    none = np.zeros((n + 1, spec.dimension))
+    for seed in range(1, 1 + EPISODES // 2):
+        natural = Instance(spec)
+        natural.reset(seed)
+        state = spec.state.copy()
+        state[own] = natural.physics.read()[own]
+        if natural.physics.depth(spec.solid) > spec.depth:
+            continue
+        inputs = [usual.drawn(rng)] * n
+        seen = natural.goes_on(inputs, none[1:])
+        other = usual.play(state, inputs, none)
+        next(other)
+        for k, (a, b) in enumerate(zip(seen, other, strict=True)):
+            # Wrappers may have seen another first observation, where the reset shows what is not up to date.
+            values = [
+                np.concatenate(
+                    [
+                        one.state[spec.places],
+                        [] if spec.wrapped else one.observation,
+                        one.report[0 if k else 1 :],
+                    ]
+                )
+                for one in (a, b)
+            ]
+            if not np.allclose(*values, rtol=SAME, atol=SAME, equal_nan=True):
+                raise BadInput(
+                    f"a run of {spec.name} that begins at the place where the reset with seed {seed} leads to "
+                    f"goes otherwise after {k + 1} sample(s) than that reset has it go: something that a reset "
+                    "sets to where it leads to stays elsewhere, and no attribute tells what. Let the first "
+                    "step() note it"
+                )
+            if any(a.report[1:3]):
+                break
