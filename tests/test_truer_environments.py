@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from environments import GOAL, XML, Puck
 from gymnasium import spaces
-from gymnasium.wrappers import FlattenObservation, TimeLimit
+from gymnasium.wrappers import FlattenObservation, NormalizeObservation, TimeLimit
 
 from hyrl_mj import BadInput, from_callable, from_gymnasium, get_task, simulate
 from hyrl_mj.gym_import import making
@@ -517,3 +517,58 @@ def test_processes_of_a_task_that_nobody_has_end():
     while made & {*multiprocessing.active_children()} and time.monotonic() < until:
         time.sleep(0.05)
     assert not made & {*multiprocessing.active_children()}
+
+
+# ---- what outlasts resets
+
+
+def normalised(load):
+    env = NormalizeObservation(FlattenObservation(Puck()))
+    env.obs_rms.mean, env.obs_rms.var = (env.obs_rms.mean + 0.1, env.obs_rms.var) if load else (0, 1)
+    env.update_running_mean = not load
+    return env
+
+
+class Weakening(Puck):
+    """Its motors weaken with the episodes; one that counts on is like new in all that matters."""
+
+    episodes, weakens = 0, True
+
+    def reset(self, **options):
+        self.episodes += 1
+        return super().reset(**options)
+
+    def step(self, action):
+        action *= max(0.2, 1 - 0.02 * self.episodes) if self.weakens else 0.5
+        return super().step(action)
+
+
+class OwnGenerator(Puck):
+    """Its resets draw the goal by a generator of the constructor."""
+
+    def __init__(self):
+        super().__init__()
+        self.rng = np.random.default_rng(42)
+
+    def reset(self, **options):
+        self.aim = self.rng.uniform(-1.5, 1.5)
+        return super().reset(**options)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: normalised(False), r"depends on .*obs_rms.*set update_running_mean = False"),
+        (Weakening, "Weakening changes from episode to episode: .* depends on episodes, "),
+        (OwnGenerator, r"draws random numbers in reset\(\), from a generator .* not decide \(rng\)"),
+    ],
+)
+def test_what_changes_from_episode_to_episode_is_refused(make, message):
+    with pytest.raises(BadInput, match=message):
+        from_gymnasium(make)
+
+
+def test_statistics_that_are_loaded_are_kept_and_a_count_is_said():
+    from_gymnasium(lambda: normalised(True))
+    task = from_gymnasium(type("Counting", (Weakening,), {"weakens": False}))
+    assert "because episodes outlasts resets" in task.found["episodes"]

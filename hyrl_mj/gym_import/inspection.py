@@ -27,7 +27,14 @@ from hyrl_mj.gym_import.observations import parts_of
 from hyrl_mj.gym_import.opening import FORMS, AnyChart, Description, layers
 from hyrl_mj.gym_import.pool import Pool
 from hyrl_mj.gym_import.specification import Criterion
-from hyrl_mj.gym_import.uses import changes_by_reset, check_noted, check_told, check_use, senses
+from hyrl_mj.gym_import.uses import (
+    changes_by_reset,
+    check_episodes,
+    check_noted,
+    check_told,
+    check_use,
+    senses,
+)
 from hyrl_mj.physics import mjcf
 from hyrl_mj.sets import Chart
 
@@ -70,6 +77,7 @@ def inspect(description: Description, untried: bool = False) -> tuple[Pool, Inst
     instance = Instance(instance.spec)  # something may have outlasted the resets of the other
     instance.learn(state=_at_rest(instance))
     _learn_bounds(instance, instance.spec.z(states), instance.spec.z(begun))
+    check_episodes(instance.spec)
     trials.check_observer(instance)
     check_use(instance.spec)
     check_noted(instance.spec)
