@@ -1,10 +1,13 @@
 """What runs leave behind, what wrappers look at, what an id stands for: as a new process would have it."""
 
+import array
 import functools
 import gc
 import itertools
 import multiprocessing
+import random
 import sys
+import threading
 import time
 from functools import partial
 
@@ -12,13 +15,20 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+import torch
 from environments import GOAL, XML, Puck
 from gymnasium import spaces
-from gymnasium.wrappers import FlattenObservation, NormalizeObservation, TimeLimit
+from gymnasium.wrappers import (
+    ClipAction,
+    FlattenObservation,
+    NormalizeObservation,
+    RecordEpisodeStatistics,
+    TimeLimit,
+)
 
 from hyrl_mj import BadInput, from_callable, from_gymnasium, get_task, simulate
 from hyrl_mj.gym_import import making
-from hyrl_mj.gym_import.fingerprint import Unknown, fingerprint
+from hyrl_mj.gym_import.fingerprint import Unknown, fingerprint, is_known
 from hyrl_mj.simulation import Recorded
 
 pytestmark = pytest.mark.slow  # a second for each environment
@@ -572,3 +582,100 @@ def test_statistics_that_are_loaded_are_kept_and_a_count_is_said():
     from_gymnasium(lambda: normalised(True))
     task = from_gymnasium(type("Counting", (Weakening,), {"weakens": False}))
     assert "because episodes outlasts resets" in task.found["episodes"]
+
+
+# ---- generators of their own
+
+
+class Rough(Puck):
+    """Each step beside the rock draws from a generator of its own, or only has it."""
+
+    draws, make, draw = True, None, None
+
+    def __init__(self):
+        super().__init__()
+        self.source = self.make()
+
+    def step(self, action):
+        if self.draws and abs(self.data.qpos[0]) < 1.5:
+            self.draw(self.source)
+        return super().step(action)
+
+
+SOURCES = {
+    "random": (lambda _: random.Random(3), lambda _, source: source.random()),
+    "method": (lambda _: random.Random(3).random, lambda _, source: source()),
+    "system": (lambda _: random.SystemRandom(), lambda _, source: source.random()),
+    "bits": (lambda _: [np.random.PCG64(1)], lambda _, source: source[0].random_raw()),
+    "torch": (lambda _: torch.Generator(), lambda _, source: torch.rand(1, generator=source)),
+    "global": (lambda _: 0, lambda *_: torch.rand(1)),
+}
+
+
+@pytest.mark.parametrize("make, draw", SOURCES.values(), ids=SOURCES)
+def test_random_numbers_in_steps_are_noticed_whoever_draws_them(make, draw):
+    kind = type("Drawing", (Rough,), {"make": make, "draw": draw})
+    with pytest.raises(BadInput, match=r"draws random numbers in step\(\) \((source|a global)"):
+        from_gymnasium(kind)
+
+
+def test_generators_that_nobody_draws_from_are_like_any_memory():
+    makes = [make for name, (make, _) in SOURCES.items() if name != "system"]
+    values = {"make": lambda self: [make(self) for make in makes], "draws": False}
+    found = from_gymnasium(type("Holding", (Rough,), values)).specification
+    assert found.memoryless and "episodes" not in found.found
+
+
+class Hidden(array.array):
+    """Has attributes, and keeps numbers in C beside them."""
+
+
+def test_what_objects_of_c_keep_is_written_down_or_unknown():
+    env = Puck()
+    env.kept = Hidden("d", [1.0])
+    env.kept.name = "row"
+    before = fingerprint(env, env.model, env.data)
+    env.kept[0] = 2.0
+    assert fingerprint(env, env.model, env.data) != before
+    env.kept = type("Lock", (threading.local,), {})()
+    assert not is_known(fingerprint(env, env.model, env.data))
+
+
+# ---- what an agent and an environment hand to each other
+
+
+class Levels(Puck):
+    def __init__(self):
+        super().__init__()
+        self.action_space = spaces.Box(-4, 4, (2,), dtype=np.int64)
+
+
+class Beginning(Puck):
+    """Observes how fast it has gone so far, which at the start is 0 / 0."""
+
+    def _get_obs(self):
+        rate = float("nan") if self.data.time == 0 else 0.0
+        return super()._get_obs() | {"to_goal": np.array([rate, 0.0])}
+
+
+@pytest.mark.parametrize(
+    ("make", "given", "message"),
+    [
+        (Levels, {}, "Levels takes a Box of int64 as its actions, .* would be rounded"),
+        (Beginning, {}, r"Beginning observes nan in observation\[\d\]"),
+        (
+            lambda: RecordEpisodeStatistics(Puck()),
+            {"success": 'info["episode"]["r"] > 0'},
+            "runs are played without RecordEpisodeStatistics, so say it by reward",
+        ),
+    ],
+)
+def test_what_would_be_handed_on_otherwise_is_refused(make, given, message):
+    with pytest.raises(BadInput, match=message):
+        from_gymnasium(make, **given)
+
+
+def test_clipped_actions_have_the_limits_within():
+    wrapped = lambda: FlattenObservation(ClipAction(Puck()))  # noqa: E731
+    task = from_gymnasium(wrapped, steps=60)
+    assert ends(task) == plain() and task.input_limits[1].tolist() == [4.0, 4.0]

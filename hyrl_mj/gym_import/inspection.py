@@ -24,7 +24,15 @@ from hyrl_mj.gym_import.expressions import Expression
 from hyrl_mj.gym_import.fingerprint import codes_of, differing, is_known
 from hyrl_mj.gym_import.instance import Instance
 from hyrl_mj.gym_import.observations import parts_of
-from hyrl_mj.gym_import.opening import FORMS, AnyChart, Description, layers
+from hyrl_mj.gym_import.opening import (
+    FORMS,
+    PEELED,
+    AnyChart,
+    Description,
+    actions_of,
+    layers,
+    made,
+)
 from hyrl_mj.gym_import.pool import Pool
 from hyrl_mj.gym_import.specification import Criterion
 from hyrl_mj.gym_import.uses import (
@@ -125,7 +133,7 @@ def _learn_spaces(instance: Instance) -> None:
             f"sensors of {instance.name} hold or delay what they measure ({named}), which noise on the state "
             "would not reach: leave out delay and interval, and put a DelayObservation around it"
         )
-    actions: Any = instance.env.action_space
+    actions = actions_of(instance.env)
     parts = parts_of(space)
     observation_low, observation_high = (
         np.concatenate([np.ravel(getattr(part, end)) for part in parts.values()], dtype=float)
@@ -263,6 +271,9 @@ def _criterion(instance: Instance, info: Sequence[str]) -> Criterion:
     for path in criterion.keys:
         if path[0] not in info and not _is_written(instance.env, path[0]):
             met = f"it has had {', '.join(info)}" if info else "it has been empty"
+            names = [type(layer).__name__ for layer in layers(made(description))]
+            if counting := [one for one in names if one in PEELED[-2:]]:
+                met += f"; runs are played without {counting[0]}, so say it by reward or terminated"
             raise BadInput(
                 f"no sampled run of {name} had {path[0]!r} in its info, and no method of it has that word: "
                 f"name an entry of info; {met}"

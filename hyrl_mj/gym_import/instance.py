@@ -22,7 +22,7 @@ from hyrl_mj.errors import BadInput, HyrlError, brief
 from hyrl_mj.gym_import import fingerprint as written
 from hyrl_mj.gym_import.expressions import entry
 from hyrl_mj.gym_import.observations import flat, observers, shaped
-from hyrl_mj.gym_import.opening import checked_step, made, peeled, physics_of, steps_of
+from hyrl_mj.gym_import.opening import actions_of, checked_step, made, peeled, physics_of, steps_of
 from hyrl_mj.gym_import.pausing import Pausing
 from hyrl_mj.gym_import.physics import Physics, set_pins
 from hyrl_mj.gym_import.specification import Derived, EnvironmentSpec
@@ -71,7 +71,7 @@ class Instance:
         self.physics = Physics(self.model, self.data)
         self.inner: Any = self.env.unwrapped
         self.is_wrapped = self.env is not self.inner
-        self._space, self._actions = self.env.observation_space, self.env.action_space
+        self._space, self._actions = self.env.observation_space, actions_of(self.env)
         self._columns = int(spaces.flatdim(self._space))
         self._observers = observers(self.env)
         self.observation, self.inner_seen = np.empty(0), None

@@ -12,7 +12,7 @@ from hyrl_mj.errors import BadInput
 from hyrl_mj.gym_import.fingerprint import differing
 from hyrl_mj.gym_import.instance import Instance
 from hyrl_mj.gym_import.observations import flat, observers
-from hyrl_mj.gym_import.plant import EnvironmentPlant
+from hyrl_mj.gym_import.plant import EnvironmentPlant, check_finite
 from hyrl_mj.gym_import.pool import Pool
 from hyrl_mj.gym_import.specification import MOVED, Derived
 from hyrl_mj.gym_import.stage import Played
@@ -189,7 +189,8 @@ def moving(pool: Pool) -> tuple[np.ndarray, np.ndarray | None]:
     """Returns which columns of an observation at rest follow the chart (o,) bool, and `affine` of a spec."""
     spec = pool.spec
     z = spec.anywhere(np.random.default_rng(0), EPISODES * (spec.dimension + 1))
-    seen, _ = pool.scatter("rest", spec.state_at(z))
+    seen, depths = pool.scatter("rest", spec.state_at(z))
+    check_finite(spec.name, seen[depths <= spec.depth])
     one = np.column_stack([z, np.ones(len(z))])
     fit = np.linalg.lstsq(one, seen, rcond=None)[0]
     exact = _rounds(np.abs(one @ fit - seen), seen).all()
