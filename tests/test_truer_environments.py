@@ -6,6 +6,7 @@ import gc
 import itertools
 import multiprocessing
 import random
+import re
 import sys
 import threading
 import time
@@ -27,8 +28,11 @@ from gymnasium.wrappers import (
 )
 
 from hyrl_mj import BadInput, from_callable, from_gymnasium, get_task, simulate
-from hyrl_mj.gym_import import making
+from hyrl_mj.gym_import import inspection, making
 from hyrl_mj.gym_import.fingerprint import Unknown, fingerprint, is_known
+from hyrl_mj.gym_import.instance import Instance
+from hyrl_mj.gym_import.opening import Description
+from hyrl_mj.gym_import.specification import EnvironmentSpec
 from hyrl_mj.simulation import Recorded
 
 pytestmark = pytest.mark.slow  # a second for each environment
@@ -679,3 +683,18 @@ def test_clipped_actions_have_the_limits_within():
     wrapped = lambda: FlattenObservation(ClipAction(Puck()))  # noqa: E731
     task = from_gymnasium(wrapped, steps=60)
     assert ends(task) == plain() and task.input_limits[1].tolist() == [4.0, 4.0]
+
+
+class Slow(Puck):
+    def step(self, action):
+        time.sleep(0.03)
+        return super().step(action)
+
+
+def test_a_slow_environment_is_said_to_take_minutes(caplog):
+    for kind in (Puck, Slow):
+        inspection._check_times(Instance(EnvironmentSpec(Description(kind))))
+    assert [re.sub(r"\d+", "N", text) for text in caplog.messages] == [
+        "Slow takes N ms for a reset and N ms for a step: to look at it, before anything else, takes about N "
+        "minute(s)"
+    ]
