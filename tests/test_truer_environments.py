@@ -33,7 +33,7 @@ from hyrl_mj.gym_import.fingerprint import Unknown, fingerprint, is_known
 from hyrl_mj.gym_import.instance import Instance
 from hyrl_mj.gym_import.opening import Description
 from hyrl_mj.gym_import.specification import EnvironmentSpec
-from hyrl_mj.simulation import Recorded
+from hyrl_mj.simulation import Noise, Recorded
 
 pytestmark = pytest.mark.slow  # a second for each environment
 STARTS = np.array([[1.0, 0.9], [0.9, -0.9], [-1.4, 0.5]])
@@ -698,3 +698,68 @@ def test_a_slow_environment_is_said_to_take_minutes(caplog):
         "Slow takes N ms for a reset and N ms for a step: to look at it, before anything else, takes about N "
         "minute(s)"
     ]
+
+
+# ---- sensors that measure in a small place, or late
+
+
+class Tag(Puck):
+    """A tag on the floor tells the place, and that fix is observed ever after."""
+
+    def reset(self, **options):
+        self.fix = np.zeros(2)
+        return super().reset(**options)
+
+    def step(self, action):
+        found = super().step(action)
+        if self.sees():
+            self.fix = self.data.qpos.copy()
+        return self._get_obs(), *found[1:]
+
+    def sees(self):
+        return (self.data.qpos > (1.95, 1.35)).all()  # in a corner
+
+    def _get_obs(self):
+        fix = getattr(self, "fix", np.zeros(2))
+        return super()._get_obs() | {"to_goal": fix}
+
+
+class Fix(Tag):
+    """It comes every 130 samples."""
+
+    def reset(self, **options):
+        self.k = 0
+        return super().reset(**options)
+
+    def sees(self):
+        self.k += 1
+        return self.k % 130 == 0
+
+
+class Timed(Fix):
+    """Observes the last action, and how many times 50 samples have passed, which no place changes."""
+
+    def sees(self):
+        return False
+
+    def step(self, action):
+        self.k += 1
+        self.fix = np.array([action[0], self.k // 50])
+        return super().step(action)
+
+
+def test_sensors_that_measure_late_or_in_a_small_place_are_refused():
+    with pytest.raises(BadInput, match=r"Fix observes does not follow its state: observation\[2\]"):
+        from_gymnasium(Fix, steps=150)
+    with pytest.raises(BadInput, match=r"observation\[\d\] of Tag is not .* step\(\) has stored it"):
+        task = from_gymnasium(Tag, steps=60)
+        agent = from_callable(lambda o: np.full((len(o), 2), 4.0), task)
+        simulate(task, agent, np.array([[1.2, 0.9]]), Noise("uniform", 0.02))
+
+
+def test_what_is_remembered_apart_from_the_place_is_observed_under_noise():
+    task = from_gymnasium(Timed, steps=60)
+    agent = from_callable(lambda o: np.full((len(o), 2), 0.5), task)
+    arcs = simulate(task, agent, STARTS, Noise("uniform", 0.1))
+    assert task.specification.recalled.tolist() == [False, False, True, True, False, False]
+    assert all(len(arc.t) for arc in arcs)

@@ -89,7 +89,7 @@ def inspect(description: Description, untried: bool = False) -> tuple[Pool, Inst
     instance.learn(state=_at_rest(instance))
     _learn_bounds(instance, instance.spec.z(states), instance.spec.z(begun))
     check_episodes(instance.spec)
-    trials.check_observer(instance)
+    instance.learn(recalled=trials.check_observer(instance))
     check_use(instance.spec)
     check_noted(instance.spec)
     derived, late = trials.derived_of(instance)

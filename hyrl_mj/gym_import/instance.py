@@ -445,6 +445,13 @@ class Instance:
         self.physics.come_back()
         return seen
 
+    def recalls(self, fresh: Instance, state: np.ndarray) -> np.ndarray:
+        """Returns which columns (o,) it observes in a state (S,) otherwise than one that has only been reset."""
+        seen = self.seen_as("now", state, np.zeros(self.spec.dimension))
+        fresh.physics.write(state)
+        usual = flat(fresh.watched(), self.inner.observation_space)
+        return np.asarray((seen != usual) & ~(np.isnan(seen) & np.isnan(usual)))
+
     def moved(self, state: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Returns a state of MuJoCo (S,) with noise (d,) added to the coordinates of the chart."""
         moved = state.copy()

@@ -164,6 +164,8 @@ class EnvironmentSpec:
         start_low, start_high: corners (d,) of the box of starts.
         max_steps: samples of an episode.
         islands: what can be passed on both sides, by name, each with the id of a geom.
+        recalled: (o,) bool, the columns of the innermost observation that episodes change apart from the
+            state, whatever their places.
         derived: `Derived`.
         sensing: whether wrappers read MuJoCo's state for what they observe, and see it under noise.
         anew: whether a reset changes what the next one does to a wrapper: each episode takes a new instance.
@@ -200,6 +202,7 @@ class EnvironmentSpec:
     start_high: tuple[float, ...] = ()
     max_steps: int = 1
     islands: Mapping[str, int] = field(default_factory=dict)
+    recalled: np.ndarray = field(default_factory=_none)
     derived: Derived = "unknown"
     sensing: bool = False
     anew: bool = False
