@@ -508,6 +508,19 @@ def test_a_model_that_does_not_tell_what_was_normalised_is_refused(tmp_path):
     assert from_callable(again, rover).act(plant.measurement).shape == (2, len(rover.inputs))
 
 
+@pytest.mark.parametrize("algorithm", [PPO, SAC])
+def test_another_environment_does_not_make_a_normalised_model_plain(algorithm, circle, tmp_path):
+    options = {"n_steps": 8, "batch_size": 8} if algorithm is PPO else {"learning_starts": 100}
+    plain = TaskVecEnv(BatchedEnv(circle, 1))
+    model = algorithm("MlpPolicy", VecNormalize(plain), seed=0, device="cpu", **options).learn(8)
+    model.save(tmp_path / "model.zip")
+    given = algorithm.load(tmp_path / "model.zip", device="cpu")
+    given.set_env(plain)
+    for found in (given, algorithm.load(tmp_path / "model.zip", env=plain, device="cpu")):
+        with pytest.raises(BadInput, match="nothing in the model tells .* load it without"):
+            from_callable(found, circle)
+
+
 # ---- from the command line
 
 

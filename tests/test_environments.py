@@ -361,24 +361,12 @@ def test_random_numbers_that_few_steps_draw_are_refused_when_they_are(own, gambl
             gamble()
 
 
-@pytest.mark.parametrize("wrapper", [Secret, Growing])
-def test_what_no_reset_clears_takes_a_new_instance_for_each_episode(wrapper, puck):
-    task = from_gymnasium(lambda: wrapper(Puck()))
-    runs = []
-    for _ in range(2):
-        plant = task.plant(2)
-        plant.set_state(*task.state(np.array([[-1.0, 0.5], [-1.2, 0.0]])))
-        for _ in range(5):
-            plant.step(np.full((2, 2), 3.0))
-        runs.append(plant.qpos)
-    alone = wrapper(Puck())
-    alone.reset(seed=0)
-    alone.unwrapped.data.qpos[:] = -1.0, 0.5
-    mujoco.mj_forward(alone.unwrapped.model, alone.unwrapped.data)
-    for _ in range(5):
-        alone.step(np.full(2, 3.0))
-    np.testing.assert_array_equal(*runs)
-    np.testing.assert_allclose(alone.unwrapped.data.qpos, runs[0][0], rtol=0, atol=1e-12)
+@pytest.mark.parametrize(("wrapper", "what"), [(Secret, "scale.count"), (Growing, "actions")])
+def test_what_no_reset_clears_and_changes_what_is_done_is_refused(wrapper, what):
+    with pytest.raises(
+        BadInput, match=f"from episode to episode: .* on {wrapper.__name__}.*{what}"
+    ):
+        from_gymnasium(lambda: wrapper(Puck()))
 
 
 def test_an_observation_in_rows_is_a_vector_row_by_row(gambling):

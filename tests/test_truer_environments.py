@@ -1,10 +1,14 @@
 """What runs leave behind, what wrappers look at, what an id stands for: as a new process would have it."""
 
+import array
 import functools
 import gc
 import itertools
 import multiprocessing
+import random
+import re
 import sys
+import threading
 import time
 from functools import partial
 
@@ -12,14 +16,24 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+import torch
 from environments import GOAL, XML, Puck
 from gymnasium import spaces
-from gymnasium.wrappers import FlattenObservation, TimeLimit
+from gymnasium.wrappers import (
+    ClipAction,
+    FlattenObservation,
+    NormalizeObservation,
+    RecordEpisodeStatistics,
+    TimeLimit,
+)
 
 from hyrl_mj import BadInput, from_callable, from_gymnasium, get_task, simulate
-from hyrl_mj.gym_import import making
-from hyrl_mj.gym_import.fingerprint import Unknown, fingerprint
-from hyrl_mj.simulation import Recorded
+from hyrl_mj.gym_import import inspection, making
+from hyrl_mj.gym_import.fingerprint import Unknown, fingerprint, is_known
+from hyrl_mj.gym_import.instance import Instance
+from hyrl_mj.gym_import.opening import Description
+from hyrl_mj.gym_import.specification import EnvironmentSpec
+from hyrl_mj.simulation import Noise, Recorded
 
 pytestmark = pytest.mark.slow  # a second for each environment
 STARTS = np.array([[1.0, 0.9], [0.9, -0.9], [-1.4, 0.5]])
@@ -517,3 +531,242 @@ def test_processes_of_a_task_that_nobody_has_end():
     while made & {*multiprocessing.active_children()} and time.monotonic() < until:
         time.sleep(0.05)
     assert not made & {*multiprocessing.active_children()}
+
+
+# ---- what outlasts resets
+
+
+def normalised(load):
+    env = NormalizeObservation(FlattenObservation(Puck()))
+    env.obs_rms.mean, env.obs_rms.var = (
+        (env.obs_rms.mean + 0.1, env.obs_rms.var) if load else (0, 1)
+    )
+    env.update_running_mean = not load
+    return env
+
+
+class Weakening(Puck):
+    """Its motors weaken with the episodes; one that counts on is like new in all that matters."""
+
+    episodes, weakens = 0, True
+
+    def reset(self, **options):
+        self.episodes += 1
+        return super().reset(**options)
+
+    def step(self, action):
+        action *= max(0.2, 1 - 0.02 * self.episodes) if self.weakens else 0.5
+        return super().step(action)
+
+
+class OwnGenerator(Puck):
+    """Its resets draw the goal by a generator of the constructor."""
+
+    def __init__(self):
+        super().__init__()
+        self.rng = np.random.default_rng(42)
+
+    def reset(self, **options):
+        self.aim = self.rng.uniform(-1.5, 1.5)
+        return super().reset(**options)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: normalised(False), r"depends on .*obs_rms.*set update_running_mean = False"),
+        (Weakening, "Weakening changes from episode to episode: .* depends on episodes, "),
+        (
+            OwnGenerator,
+            r"draws random numbers in reset\(\), from a generator .* not decide \(rng\)",
+        ),
+    ],
+)
+def test_what_changes_from_episode_to_episode_is_refused(make, message):
+    with pytest.raises(BadInput, match=message):
+        from_gymnasium(make)
+
+
+def test_statistics_that_are_loaded_are_kept_and_a_count_is_said():
+    from_gymnasium(lambda: normalised(True))
+    task = from_gymnasium(type("Counting", (Weakening,), {"weakens": False}))
+    assert "because episodes outlasts resets" in task.found["episodes"]
+
+
+# ---- generators of their own
+
+
+class Rough(Puck):
+    """Each step beside the rock draws from a generator of its own, or only has it."""
+
+    draws, make, draw = True, None, None
+
+    def __init__(self):
+        super().__init__()
+        self.source = self.make()
+
+    def step(self, action):
+        if self.draws and abs(self.data.qpos[0]) < 1.5:
+            self.draw(self.source)
+        return super().step(action)
+
+
+SOURCES = {
+    "random": (lambda _: random.Random(3), lambda _, source: source.random()),
+    "method": (lambda _: random.Random(3).random, lambda _, source: source()),
+    "system": (lambda _: random.SystemRandom(), lambda _, source: source.random()),
+    "bits": (lambda _: [np.random.PCG64(1)], lambda _, source: source[0].random_raw()),
+    "torch": (lambda _: torch.Generator(), lambda _, source: torch.rand(1, generator=source)),
+    "global": (lambda _: 0, lambda *_: torch.rand(1)),
+}
+
+
+@pytest.mark.parametrize("make, draw", SOURCES.values(), ids=SOURCES)
+def test_random_numbers_in_steps_are_noticed_whoever_draws_them(make, draw):
+    kind = type("Drawing", (Rough,), {"make": make, "draw": draw})
+    with pytest.raises(BadInput, match=r"draws random numbers in step\(\) \((source|a global)"):
+        from_gymnasium(kind)
+
+
+def test_generators_that_nobody_draws_from_are_like_any_memory():
+    makes = [make for name, (make, _) in SOURCES.items() if name != "system"]
+    values = {"make": lambda self: [make(self) for make in makes], "draws": False}
+    found = from_gymnasium(type("Holding", (Rough,), values)).specification
+    assert found.memoryless and "episodes" not in found.found
+
+
+class Hidden(array.array):
+    """Has attributes, and keeps numbers in C beside them."""
+
+
+def test_what_objects_of_c_keep_is_written_down_or_unknown():
+    env = Puck()
+    env.kept = Hidden("d", [1.0])
+    env.kept.name = "row"
+    before = fingerprint(env, env.model, env.data)
+    env.kept[0] = 2.0
+    assert fingerprint(env, env.model, env.data) != before
+    env.kept = type("Lock", (threading.local,), {})()
+    assert not is_known(fingerprint(env, env.model, env.data))
+
+
+# ---- what an agent and an environment hand to each other
+
+
+class Levels(Puck):
+    def __init__(self):
+        super().__init__()
+        self.action_space = spaces.Box(-4, 4, (2,), dtype=np.int64)
+
+
+class Beginning(Puck):
+    """Observes how fast it has gone so far, which at the start is 0 / 0."""
+
+    def _get_obs(self):
+        rate = float("nan") if self.data.time == 0 else 0.0
+        return super()._get_obs() | {"to_goal": np.array([rate, 0.0])}
+
+
+@pytest.mark.parametrize(
+    ("make", "given", "message"),
+    [
+        (Levels, {}, "Levels takes a Box of int64 as its actions, .* would be rounded"),
+        (Beginning, {}, r"Beginning observes nan in observation\[\d\]"),
+        (
+            lambda: RecordEpisodeStatistics(Puck()),
+            {"success": 'info["episode"]["r"] > 0'},
+            "runs are played without RecordEpisodeStatistics, so say it by reward",
+        ),
+    ],
+)
+def test_what_would_be_handed_on_otherwise_is_refused(make, given, message):
+    with pytest.raises(BadInput, match=message):
+        from_gymnasium(make, **given)
+
+
+def test_clipped_actions_have_the_limits_within():
+    wrapped = lambda: FlattenObservation(ClipAction(Puck()))  # noqa: E731
+    task = from_gymnasium(wrapped, steps=60)
+    assert ends(task) == plain() and task.input_limits[1].tolist() == [4.0, 4.0]
+
+
+class Slow(Puck):
+    def step(self, action):
+        time.sleep(0.03)
+        return super().step(action)
+
+
+def test_a_slow_environment_is_said_to_take_minutes(caplog):
+    for kind in (Puck, Slow):
+        inspection._check_times(Instance(EnvironmentSpec(Description(kind))))
+    assert [re.sub(r"\d+", "N", text) for text in caplog.messages] == [
+        "Slow takes N ms for a reset and N ms for a step: to look at it, before anything else, takes about N "
+        "minute(s)"
+    ]
+
+
+# ---- sensors that measure in a small place, or late
+
+
+class Tag(Puck):
+    """A tag on the floor tells the place, and that fix is observed ever after."""
+
+    def reset(self, **options):
+        self.fix = np.zeros(2)
+        return super().reset(**options)
+
+    def step(self, action):
+        found = super().step(action)
+        if self.sees():
+            self.fix = self.data.qpos.copy()
+        return self._get_obs(), *found[1:]
+
+    def sees(self):
+        return (self.data.qpos > (1.95, 1.35)).all()  # in a corner
+
+    def _get_obs(self):
+        fix = getattr(self, "fix", np.zeros(2))
+        return super()._get_obs() | {"to_goal": fix}
+
+
+class Fix(Tag):
+    """It comes every 130 samples."""
+
+    def reset(self, **options):
+        self.k = 0
+        return super().reset(**options)
+
+    def sees(self):
+        self.k += 1
+        return self.k % 130 == 0
+
+
+class Timed(Fix):
+    """Observes the last action, and how many times 50 samples have passed, which no place changes."""
+
+    def sees(self):
+        return False
+
+    def step(self, action):
+        self.k += 1
+        self.fix = np.array([action[0], self.k // 50])
+        return super().step(action)
+
+
+def test_sensors_that_measure_late_or_in_a_small_place_are_refused():
+    with pytest.raises(BadInput, match=r"Fix observes does not follow its state: observation\[2\]"):
+        from_gymnasium(Fix, steps=150)
+    with pytest.raises(
+        BadInput, match=r"observation\[\d\] of Tag is not .* step\(\) has stored it"
+    ):
+        task = from_gymnasium(Tag, steps=60)
+        agent = from_callable(lambda o: np.full((len(o), 2), 4.0), task)
+        simulate(task, agent, np.array([[1.2, 0.9]]), Noise("uniform", 0.02))
+
+
+def test_what_is_remembered_apart_from_the_place_is_observed_under_noise():
+    task = from_gymnasium(Timed, steps=60)
+    agent = from_callable(lambda o: np.full((len(o), 2), 0.5), task)
+    arcs = simulate(task, agent, STARTS, Noise("uniform", 0.1))
+    assert task.specification.recalled.tolist() == [False, False, True, True, False, False]
+    assert all(len(arc.t) for arc in arcs)

@@ -7,8 +7,11 @@ never set: pickles of them are written, and none is read.
 
 from __future__ import annotations
 
+import copyreg
 import marshal
+import os
 import pickle
+import random
 import sys
 from collections import deque
 from collections.abc import Mapping, Set
@@ -44,9 +47,10 @@ MOVES = (
     "qpos", "body_", "jnt_", "dof_", "geom_", "site_", "tendon_", "wrap_", "actuator_", "sensor_", "eq_",
     "pair_", "exclude_", "numeric_data", "hfield_data", "flex_",
 )  # fmt: skip
+GENERATORS = np.random.Generator, np.random.RandomState, np.random.BitGenerator, random.Random
 PLAIN = (type(None), bool, int, float, complex, str, bytes)
 # The kinds of variables of a class or a module whose values can change.
-DATA = (*PLAIN, list, dict, set, deque, tuple, np.ndarray, np.generic, np.random.Generator)
+DATA = (*PLAIN, list, dict, set, deque, tuple, np.ndarray, np.generic, *GENERATORS)
 FUNCTIONS = FunctionType | MethodType
 
 
@@ -154,8 +158,14 @@ def is_shared(name: str) -> bool:
 
 def state_of(generator: Any) -> bytes:
     """Returns the state of a generator of random numbers, to compare it."""
-    bits = getattr(generator, "bit_generator", None)
-    return pickle.dumps(generator.get_state() if bits is None else bits.state)
+    if isinstance(generator, random.SystemRandom):
+        return os.urandom(16)  # the system's, which nothing tells: it never is as it was
+    if isinstance(generator, random.Random):
+        return pickle.dumps(generator.getstate())
+    if _is_of_torch(generator, "Generator"):
+        return bytes(generator.get_state().numpy())
+    bits = getattr(generator, "bit_generator", generator)
+    return pickle.dumps(bits.state if hasattr(bits, "state") else generator.get_state())
 
 
 def _walk(value: Any, path: str, found: Fingerprint, seen: set[int], depth: int) -> None:
@@ -164,7 +174,7 @@ def _walk(value: Any, path: str, found: Fingerprint, seen: set[int], depth: int)
         found[path] = marshal.dumps(value, 0)  # NaN equals NaN so
     elif isinstance(value, np.ndarray | np.generic) and value.dtype.kind in "biufcSU":
         found[path] = value.shape, value.dtype.str, value.tobytes()
-    elif isinstance(value, np.random.Generator | np.random.RandomState):
+    elif isinstance(value, GENERATORS) or _is_of_torch(value, "Generator"):
         found[path], found.generators[path] = state_of(value), value
     elif isinstance(value, spaces.Space):
         parts: Any = getattr(value, "spaces", ())  # of a Dict or a Tuple
@@ -209,9 +219,11 @@ def _parts(value: Any, path: str, found: Fingerprint, depth: int) -> dict[str, A
         return {f"{path}[{repr(key)[:40]}]": item for key, item in value.items()}
     if isinstance(value, FUNCTIONS):
         return {f"{path}.{name}": part for name, part in _variables_of(value).items()}
+    if isinstance(value, BuiltinFunctionType):
+        return {f"{path}.self": value.__self__}
     if isinstance(value, partial):
         return {f"{path}()": [value.func, value.args, value.keywords]}
-    if type(value).__module__.partition(".")[0] == "torch" and hasattr(value, "detach"):
+    if _is_of_torch(value, "Tensor"):
         return {path: value.detach().cpu().numpy()}
     if not hasattr(value, "__dict__"):
         try:
@@ -225,7 +237,25 @@ def _parts(value: Any, path: str, found: Fingerprint, depth: int) -> dict[str, A
     passed = "_ezpickle_args", "_ezpickle_kwargs", "_saved_kwargs", "step", "reset"
     left_out = passed if depth == 0 else ()
     own = {name: part for name, part in vars(value).items() if name not in left_out}
+    if _has_more(type(value)):
+        try:
+            slots = {**(slots or {}), "()": value.__reduce_ex__(2)[1:3]}
+        except Exception:  # it cannot be written down
+            found[path] = Unknown(id(value))
     return {f"{path}.{name}" if path else name: part for name, part in {**own, **slots}.items()}
+
+
+@cache
+def _has_more(kind: type) -> bool:
+    """Returns whether objects of a class keep something beside attributes, as those of C do."""
+    pointers = (kind.__dictoffset__ > 0) + (kind.__weakrefoffset__ > 0)  # type: ignore[attr-defined]
+    slots = len(copyreg._slotnames(kind))  # type: ignore[attr-defined]
+    return kind.__basicsize__ > object.__basicsize__ + 8 * (pointers + slots)
+
+
+def _is_of_torch(value: Any, name: str) -> bool:
+    torch = sys.modules.get("torch")
+    return torch is not None and isinstance(value, getattr(torch, name))
 
 
 def _variables_of(function: Any) -> dict[str, Any]:
@@ -244,7 +274,9 @@ def has_no_memory(value: Any) -> bool:
     """Returns whether a value is of a kind that remembers nothing outside of MuJoCo's state."""
     if isinstance(value, FUNCTIONS):
         return not _variables_of(value)
-    if isinstance(value, type | ModuleType | BuiltinFunctionType | property):
+    if isinstance(value, BuiltinFunctionType):  # of a module, or of an object of C
+        return isinstance(value.__self__, type | ModuleType | None)
+    if isinstance(value, type | ModuleType | property):
         return True
     return _is_passed(type(value).__module__ or "")
 
@@ -285,4 +317,9 @@ def _with_inner(code: CodeType) -> list[CodeType]:
 @cache
 def _data_of(owner: Any, size: int) -> list[str]:
     """Returns the names of the variables of a class or module, of so many names, that can change."""
-    return [n for n, v in vars(owner).items() if not n.startswith("__") and isinstance(v, DATA)]
+    return [
+        name
+        for name, value in vars(owner).items()
+        if not name.startswith("__")
+        and (isinstance(value, DATA) or _is_of_torch(value, "Generator"))
+    ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -24,14 +25,30 @@ from hyrl_mj.gym_import.expressions import Expression
 from hyrl_mj.gym_import.fingerprint import codes_of, differing, is_known
 from hyrl_mj.gym_import.instance import Instance
 from hyrl_mj.gym_import.observations import parts_of
-from hyrl_mj.gym_import.opening import FORMS, AnyChart, Description, layers
+from hyrl_mj.gym_import.opening import (
+    FORMS,
+    PEELED,
+    AnyChart,
+    Description,
+    actions_of,
+    layers,
+    made,
+)
 from hyrl_mj.gym_import.pool import Pool
 from hyrl_mj.gym_import.specification import Criterion
 from hyrl_mj.gym_import.starts import check_noted, resets_of
-from hyrl_mj.gym_import.uses import changes_by_reset, check_told, check_use, senses
+from hyrl_mj.gym_import.uses import (
+    changes_by_reset,
+    check_episodes,
+    check_told,
+    check_use,
+    senses,
+)
 from hyrl_mj.physics import mjcf
 from hyrl_mj.sets import Chart
 
+# Resets and steps of an inspection, about, and from how long on it is said how long it takes [s].
+TAKEN, LONG = (500, 11_000), 60.0
 # What is said of an observation that shows derived quantities from before the end of a step.
 LAG = {
     "earlier": "is that of a physics step before the end of a step, with noise, too",
@@ -71,7 +88,8 @@ def inspect(description: Description, untried: bool = False) -> tuple[Pool, Inst
     instance = Instance(instance.spec)  # something may have outlasted the resets of the other
     instance.learn(state=_at_rest(instance))
     _learn_bounds(instance, instance.spec.z(states), instance.spec.z(resets.states))
-    trials.check_observer(instance)
+    check_episodes(instance.spec)
+    instance.learn(recalled=trials.check_observer(instance))
     check_use(instance.spec)
     check_noted(instance.spec, resets)
     derived, late = trials.derived_of(instance)
@@ -93,19 +111,29 @@ def inspect(description: Description, untried: bool = False) -> tuple[Pool, Inst
 
 
 def _check_times(instance: Instance) -> None:
-    """Raises `BadInput` if a reset or a step takes so long that runs would take hours."""
+    """Raises `BadInput` if a reset or a step takes so long that runs would take hours; says so of minutes."""
     u = instance.drawn(np.random.default_rng(0))
-    for name, most, why, take in (
+    works = (
         ("reset", 3.0, "each of thousands of episodes begins with it", instance.reset),
         ("step", 0.3, "thousands of episodes take many of them", lambda: instance.stepped(u)),
-    ):
-        began = time.monotonic()
-        take()
-        if (took := time.monotonic() - began) > most:
-            raise BadInput(
-                f"{name}() of {instance.name} takes {took:.1f} s, and {why}: give an environment whose "
-                f"{name} takes less than {most:g} s"
-            )
+    )
+    for again in (False, True):  # the first time it may have to get ready
+        times = []
+        for name, most, why, take in works:
+            began = time.monotonic()
+            take()
+            times.append(took := time.monotonic() - began)
+            if took > most and not again:
+                raise BadInput(
+                    f"{name}() of {instance.name} takes {took:.1f} s, and {why}: give an environment whose "
+                    f"{name} takes less than {most:g} s"
+                )
+        if (spent := np.dot(times, TAKEN)) < LONG:
+            return
+    logging.getLogger("hyrl_mj").warning(
+        f"{instance.name} takes {1e3 * times[0]:.0f} ms for a reset and {1e3 * times[1]:.0f} ms for a step: "
+        f"to look at it, before anything else, takes about {spent / 60:.0f} minute(s)"
+    )
 
 
 def _learn_spaces(instance: Instance) -> None:
@@ -118,7 +146,7 @@ def _learn_spaces(instance: Instance) -> None:
             f"sensors of {instance.name} hold or delay what they measure ({named}), which noise on the state "
             "would not reach: leave out delay and interval, and put a DelayObservation around it"
         )
-    actions: Any = instance.env.action_space
+    actions = actions_of(instance.env)
     parts = parts_of(space)
     observation_low, observation_high = (
         np.concatenate([np.ravel(getattr(part, end)) for part in parts.values()], dtype=float)
@@ -256,6 +284,9 @@ def _criterion(instance: Instance, info: Sequence[str]) -> Criterion:
     for path in criterion.keys:
         if path[0] not in info and not _is_written(instance.env, path[0]):
             met = f"it has had {', '.join(info)}" if info else "it has been empty"
+            names = [type(layer).__name__ for layer in layers(made(description))]
+            if counting := [one for one in names if one in PEELED[-2:]]:
+                met += f"; runs are played without {counting[0]}, so say it by reward or terminated"
             raise BadInput(
                 f"no sampled run of {name} had {path[0]!r} in its info, and no method of it has that word: "
                 f"name an entry of info; {met}"

@@ -22,7 +22,7 @@ from hyrl_mj.errors import BadInput, HyrlError, brief
 from hyrl_mj.gym_import import fingerprint as written
 from hyrl_mj.gym_import.expressions import entry
 from hyrl_mj.gym_import.observations import flat, observers, shaped
-from hyrl_mj.gym_import.opening import checked_step, made, peeled, physics_of, steps_of
+from hyrl_mj.gym_import.opening import actions_of, checked_step, made, peeled, physics_of, steps_of
 from hyrl_mj.gym_import.pausing import Pausing
 from hyrl_mj.gym_import.physics import Physics, set_pins
 from hyrl_mj.gym_import.specification import Derived, EnvironmentSpec
@@ -72,7 +72,7 @@ class Instance:
         self.physics = Physics(self.model, self.data)
         self.inner: Any = self.env.unwrapped
         self.is_wrapped = self.env is not self.inner
-        self._space, self._actions = self.env.observation_space, self.env.action_space
+        self._space, self._actions = self.env.observation_space, actions_of(self.env)
         self._columns = int(spaces.flatdim(self._space))
         self._observers = observers(self.env)
         self.observation, self.inner_seen = np.empty(0), None
@@ -452,6 +452,13 @@ class Instance:
         seen = flat(self.watched(), self.inner.observation_space)
         self.physics.come_back()
         return seen
+
+    def recalls(self, fresh: Instance, state: np.ndarray) -> np.ndarray:
+        """Returns which columns (o,) it observes in a state (S,) otherwise than one that has only been reset."""
+        seen = self.seen_as("now", state, np.zeros(self.spec.dimension))
+        fresh.physics.write(state)
+        usual = flat(fresh.watched(), self.inner.observation_space)
+        return np.asarray((seen != usual) & ~(np.isnan(seen) & np.isnan(usual)))
 
     def moved(self, state: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Returns a state of MuJoCo (S,) with noise (d,) added to the coordinates of the chart."""

@@ -318,6 +318,7 @@ _INSTEAD = {
     "kept": "reset, pinned or seed",
     "goal": "reset, pinned or seed",
     "ways": "chart",
+    "episodes": "an environment whose reset() sets that back",
     "lag": "an environment that calls mj_forward at the end of step()",
     "sample time": "kwargs, such as frame_skip, if the environment takes it",
     "camera": "task.scene another one in Python",

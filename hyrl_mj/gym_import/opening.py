@@ -269,12 +269,26 @@ def _checked(env: Any, name: str) -> mujoco.MjModel:
                 f"{name} observes {what} {getattr(part, 'shape', '')}: hyrl_mj takes vectors, or a Dict of "
                 "vectors; choose the observation of its state"
             )
-    actions: Any = env.action_space
+    actions = actions_of(env)
     if not isinstance(actions, spaces.Box | spaces.Discrete):
         raise BadInput(f"{name} takes actions of {actions}: hyrl_mj takes a Box, or Discrete")
+    if isinstance(actions, spaces.Box) and actions.dtype.kind != "f":
+        raise BadInput(
+            f"{name} takes a Box of {actions.dtype} as its actions, to which an agent's numbers would be "
+            "rounded: let it take a Box of floats, or Discrete"
+        )
     if isinstance(actions, spaces.Box) and not np.isfinite([actions.low, actions.high]).all():
-        raise BadInput(f"{name} takes actions without limits: wrap it in gymnasium's RescaleAction")
+        raise BadInput(f"{name} takes actions without limits: give its action_space limits")
     return physics[0]
+
+
+def actions_of(env: gym.Env) -> Any:
+    """Returns the space of the actions that an environment takes: that to which a ClipAction clips them."""
+    for layer in layers(env):
+        clips = isinstance(layer, gym.wrappers.ClipAction)
+        if not (clips or (isinstance(layer, gym.Wrapper) and layer._action_space is None)):
+            return layer.action_space
+    return env.action_space
 
 
 def checked_step(result: Any, name: str) -> tuple[Any, float, Any, Any, dict[str, Any]]:

@@ -22,6 +22,16 @@ PLAYED = 1024
 _NUMBERS = count()
 
 
+def check_finite(name: str, seen: np.ndarray) -> None:
+    """Raises `BadInput` unless observations (k, o) of an environment of a name are finite numbers."""
+    if (blank := np.argwhere(~np.isfinite(seen))).size:
+        row, column = blank[0]
+        raise BadInput(
+            f"{name} observes {seen[row, column]} in observation[{column}], and policies take "
+            "finite numbers: let it observe finite numbers, such as the longest range of a sensor"
+        )
+
+
 class EnvironmentPlant:
     """n runs of an environment, with the interface of `hyrl_mj.physics.plant.Plant`.
 
@@ -175,6 +185,7 @@ class EnvironmentPlant:
         self._unstable[rows], self._open[rows] = False, True
         seen, depths = self._pool.scatter("rest", self._state[rows])
         blocked = depths > self.spec.depth
+        check_finite(self.spec.name, seen[~blocked])
         outcome = np.where(blocked, Outcome.CRASHED, Outcome.RUNNING)
         nothing = np.zeros((len(rows), 2))
         self._truth[rows] = np.column_stack(
@@ -203,13 +214,7 @@ class EnvironmentPlant:
             states, seen, reports = self._ask("act", rows, u)
         self._open[rows] = True
         finite = np.isfinite(states).all(axis=1)
-        if (blank := finite & ~np.isfinite(seen).all(axis=1)).any():
-            of_run = seen[int(blank.argmax())]
-            column = int(np.isfinite(of_run).argmin())
-            raise BadInput(
-                f"{self.spec.name} observes {of_run[column]} in observation[{column}], and policies take "
-                "finite numbers: let it observe finite numbers, such as the longest range of a sensor"
-            )
+        check_finite(self.spec.name, seen[finite])
         some = rows[finite]
         self._state[some] = states[finite]
         self._truth[some, : self.spec.dimension] = self.spec.z(states[finite])

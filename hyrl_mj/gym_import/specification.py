@@ -185,6 +185,8 @@ class EnvironmentSpec:
         max_steps: samples of an episode.
         islands: what can be passed on both sides, by name, each with the id of a geom.
         plane: the axes of the world that the first two coordinates follow; none if they do not.
+        recalled: (o,) bool, the columns of the innermost observation that episodes change apart from the
+            state, whatever their places.
         derived: `Derived`.
         sensing: whether wrappers read MuJoCo's state for what they observe, and see it under noise.
         anew: whether a reset changes what the next one does to a wrapper: each episode takes a new instance.
@@ -222,6 +224,7 @@ class EnvironmentSpec:
     max_steps: int = 1
     islands: Mapping[str, int] = field(default_factory=dict)
     plane: tuple[Axis, ...] = ()
+    recalled: np.ndarray = field(default_factory=_none)
     derived: Derived = "unknown"
     sensing: bool = False
     anew: bool = False

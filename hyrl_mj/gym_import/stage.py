@@ -62,6 +62,7 @@ class Stage:
         # Which play nothing but what they judge, as their user has them, or without time limits.
         self._judges: dict[bool, list[Instance]] = {True: [], False: []}
         self._resting: Instance | None = None
+        self._fresh: Instance | None = None  # which has only been reset
         self._shared: written.Fingerprint | None = None  # by a new instance with all others
 
     def try_out(self) -> Arrays:
@@ -147,6 +148,9 @@ class Stage:
 
     def check(self, runs: Sequence[Played]) -> None:
         """Plays runs in new environments; raises `BadInput` if these go another way."""
+        if self._fresh is None:
+            self._fresh = self._new(real=False)
+            self._fresh.reset()
         for run in runs:
             # A time limit of its own would end a run that is simulated for longer.
             as_it_is = len(run.inputs) <= self.spec.max_steps
@@ -155,7 +159,7 @@ class Stage:
                 noises.append(np.zeros_like(run.noise))
             for noise in noises:
                 real = self._renewed(self._judges[as_it_is], as_it_is)
-                judge(run, real, noise)
+                judge(run, real, noise, self._fresh)
                 self._judges[as_it_is].append(real)
 
     def _acted(
@@ -195,7 +199,7 @@ class Stage:
         return instance
 
 
-def judge(run: Played, real: Instance, noise: np.ndarray) -> None:
+def judge(run: Played, real: Instance, noise: np.ndarray, fresh: Instance) -> None:
     """Plays a run in an environment that its user would make.
 
     That is put to the start and stepped, past all that lets episodes be played side by side. There is no
@@ -207,12 +211,24 @@ def judge(run: Played, real: Instance, noise: np.ndarray) -> None:
         run: the run.
         real: the environment.
         noise: (k + 1, d) that of the run, or none.
+        fresh: another one, which has only been reset: what it observes in a state shows what `real` has
+            stored on its way there.
 
     Raises:
         BadInput: the run went otherwise.
     """
     spec, heard = real.spec, noise is run.noise
-    samples = [*real.play(run.start, run.inputs, noise)]
+    samples = []
+    for sample in real.play(run.start, run.inputs, noise):
+        samples.append(sample)
+        if not (heard and noise.any() and len(samples) > 1 and np.isfinite(sample.state).all()):
+            continue
+        if (stored := real.recalls(fresh, sample.state) & ~spec.recalled).any():
+            raise BadInput(
+                f"observation[{stored.argmax()}] of {real.name} is not what it observes in its state, after "
+                f"{len(samples) - 1} sample(s): step() has stored it on the way, as a sensor that measures "
+                "now and then, and noise does not reach it; compute it from the state"
+            )
     real.finish()
     states, observations, reports = zip(*samples, strict=True)
     path = np.vstack([run.path[:1], spec.z(np.array(states[1:]).reshape(-1, len(run.start)))])

@@ -298,7 +298,7 @@ def _compare_noted(
     other.noted = lambda: _set(other, noted)
     ours, theirs = usual.play(starts[0], inputs, none), other.play(starts[1], inputs, none)
     k, differs = 0, False
-    for k, pair in enumerate(_both(ours, theirs)):  # noqa: B007
+    for k, pair in enumerate(_both(ours, theirs)):
         if pair is None:
             differs = True
             break
@@ -306,7 +306,10 @@ def _compare_noted(
             return
         # The first reward after a start is of what shapes it, and it alone is not judged by.
         first = 0 if "reward" in spec.criterion.asked or k > 1 else 1
-        a, b = (np.concatenate([spec.z(s.state[None])[0], s.observation, s.report[first:]]) for s in pair)
+        a, b = (
+            np.concatenate([spec.z(s.state[None])[0], s.observation, s.report[first:]])
+            for s in pair
+        )
         if differs := not np.array_equal(a, b, equal_nan=True):
             break
         if any(pair[0].report[1:3]):

@@ -12,7 +12,7 @@ from hyrl_mj.errors import BadInput
 from hyrl_mj.gym_import.fingerprint import differing
 from hyrl_mj.gym_import.instance import Instance
 from hyrl_mj.gym_import.observations import flat, observers
-from hyrl_mj.gym_import.plant import EnvironmentPlant
+from hyrl_mj.gym_import.plant import EnvironmentPlant, check_finite
 from hyrl_mj.gym_import.pool import Pool
 from hyrl_mj.gym_import.specification import MOVED, Derived
 from hyrl_mj.gym_import.stage import Played
@@ -20,8 +20,8 @@ from hyrl_mj.gym_import.stage import Played
 # Episodes and samples of a trial, and for how many samples inputs are held.
 EPISODES, SAMPLES, HELD = 8, 40, 8
 # Places on the chart from which runs of so many samples come to one state, which may show where they were;
-# from the first places longer ones, in which slow sensors measure.
-PLACES, AWAY, LONG = 64, 2, (SAMPLES, 120)
+# from the first places whole episodes, in which slow sensors measure.
+PLACES, AWAY, FAR = 64, 2, 5
 
 
 def observer_of(instance: Instance) -> str:
@@ -101,41 +101,48 @@ def _rounds(off: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.asarray(off <= 1e-9 * max(float(sizes.max(initial=0.0)), 1.0))
 
 
-def check_observer(instance: Instance) -> None:
-    """Raises `BadInput` if what is observed in a state depends on where on the chart a run came from.
+def check_observer(instance: Instance) -> np.ndarray:
+    """Returns `recalled` of a spec; raises `BadInput` if more than these columns depend on the way to a state.
 
     Runs under the same inputs are put into one state. What they observe there has to be the same to the bit:
     what is stored on the way differs, if only by rounding.
     """
     spec, name, usual = instance.spec, instance.name, dict[int, np.ndarray]()
+    fresh = Instance(spec)
+    fresh.reset()
+    none, recalled = np.zeros(spec.dimension), np.zeros(1, dtype=bool)
     states = spec.state_at(spec.anywhere(np.random.default_rng(7), PLACES))
+    # Most runs are short, and some go to their ends.
     runs = [(state, AWAY) for state in states]
-    runs += [(state, min(away, spec.max_steps)) for away in LONG for state in states[:EPISODES]]
+    runs += [(state, spec.max_steps) for state in states[:FAR]]
     for state, away in runs:
         instance.reset()
         instance.physics.write(state)
         if instance.physics.depth(instance.spec.solid) > spec.depth:
             continue
-        if len([*instance.wander(np.random.default_rng(8), away, HELD)]) < away:
-            continue
-        if away != AWAY:
-            before = instance.memory()
-            instance.displaced(spec.nudge)
-            if changed := differing(instance.memory(), before):
+        for k, result in enumerate(instance.wander(np.random.default_rng(8), away, HELD), 1):
+            if any(result[2:4]) or (k != AWAY and k % HELD):
+                continue
+            if k == SAMPLES:
+                before = instance.memory()
+                instance.displaced(spec.nudge)
+                if changed := differing(instance.memory(), before):
+                    raise BadInput(
+                        f"{name} changes {changed[0]} when it computes what it observes, so that cannot be "
+                        "asked for where noise shows the robot: let it only read"
+                    )
+            seen = instance.seen_as("now", spec.state, none)
+            recalled = recalled | instance.recalls(fresh, spec.state)
+            off = _apart(seen, usual.setdefault(k, seen))
+            if off.any():
+                column = int((off != 0).argmax())
                 raise BadInput(
-                    f"{name} changes {changed[0]} when it computes what it observes, so that cannot be asked "
-                    "for where noise shows the robot: let it only read"
+                    f"what {name} observes does not follow its state: observation[{column}] differs by "
+                    f"{off[column]:.6g} in one state, after runs in different places. It is stored by "
+                    "step(), or computed from what is, so that noise would not reach it: compute it from the "
+                    "state"
                 )
-        instance.physics.write(spec.state)
-        seen = flat(instance.watched(), instance.inner.observation_space)
-        off = _apart(seen, usual.setdefault(away, seen))
-        if off.any():
-            column = int((off != 0).argmax())
-            raise BadInput(
-                f"what {name} observes does not follow its state: observation[{column}] differs by "
-                f"{off[column]:.6g} in one state, after runs in different places. It is stored by step(), or "
-                "computed from what is, so that noise would not reach it: compute it from the state"
-            )
+    return recalled
 
 
 def derived_of(instance: Instance) -> tuple[Derived, list[int]]:
@@ -189,7 +196,8 @@ def moving(pool: Pool) -> tuple[np.ndarray, np.ndarray | None]:
     """Returns which columns of an observation at rest follow the chart (o,) bool, and `affine` of a spec."""
     spec = pool.spec
     z = spec.anywhere(np.random.default_rng(0), EPISODES * (spec.dimension + 1))
-    seen, _ = pool.scatter("rest", spec.state_at(z))
+    seen, depths = pool.scatter("rest", spec.state_at(z))
+    check_finite(spec.name, seen[depths <= spec.depth])
     one = np.column_stack([z, np.ones(len(z))])
     fit = np.linalg.lstsq(one, seen, rcond=None)[0]
     exact = _rounds(np.abs(one @ fit - seen), seen).all()

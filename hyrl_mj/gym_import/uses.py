@@ -10,6 +10,7 @@ import copy
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -96,7 +97,7 @@ def check_use(spec: EnvironmentSpec) -> None:
     for state in spec.state_at(spec.anywhere(rng, EPISODES)):
         wrapped.reset()
         wrapped.arrive(state)
-        if not (true.put(state) and noisy.put(state)):
+        if not all([one.put(state) for one in (true, noisy)]):  # both, whose resets are as many
             continue
         for k in range(min(SAMPLES, spec.max_steps)):
             if k % HELD == 0:
@@ -106,7 +107,7 @@ def check_use(spec: EnvironmentSpec) -> None:
             if len(actions) != 1:  # of wrappers which step several times, or not at all
                 return
             try:
-                seen, result = true.step(actions[0], 0 * half)
+                seen, result = true.step(copy.copy(actions[0]), 0 * half)
                 moved, other = noisy.step(copy.copy(actions[0]), rng.uniform(-half, half))
             except (Exception, SystemExit):  # step() may not be able to work with such observations
                 break
@@ -145,6 +146,51 @@ def changes_by_reset(spec: EnvironmentSpec) -> bool:
     usual = set(differing(found[0][1], found[1][1]))  # such as names of files
     changed = set(differing(found[0][1], found[2][1])) - usual
     return bool(changed) or not np.array_equal(found[0][0], found[2][0], equal_nan=True)
+
+
+def check_episodes(spec: EnvironmentSpec) -> None:
+    """Raises `BadInput` if what outlasts resets changes what is observed or done in later episodes.
+
+    Each episode is played by an environment that is like new, and its user's goes on with what it remembers.
+    """
+    rng, none = np.random.default_rng(13), np.zeros((SAMPLES + 1, spec.dimension))
+    everyone = new, twin, old = [Instance(spec) for _ in range(3)]
+    inputs = [new.drawn(rng) for _ in range(SAMPLES)]
+    for _ in range(3):
+        old.reset()
+        for _ in old.wander(rng, SAMPLES, HELD):
+            pass
+    runs = [one.play(spec.state, inputs, none) for one in everyone]
+    seen = [next(run) for run in runs]
+    remembered = [one.memory() for one in everyone]
+    usual = {*differing(*remembered[:2])}  # such as names of files
+    names = [name for name in differing(remembered[2], remembered[0]) if name not in usual]
+    if drawn := [name for name in names if name in remembered[0].generators]:
+        raise BadInput(
+            f"{spec.name} draws random numbers in reset(), from a generator that its seed does not decide "
+            f"({drawn[0]}): let it draw from self.np_random"
+        )
+    if names:
+        spec.found["episodes"] = (
+            f"each is played by a new environment, because {', '.join(names[:4])} outlasts resets; no trial "
+            "of three episodes shows that what comes next depends on it"
+        )
+    first = 0 if "reward" in spec.criterion.asked else 1  # of the report, by which it is judged
+    while len(seen) == len(runs):
+        told = [np.concatenate([one.state, one.observation, one.report[first:]]) for one in seen]
+        if not np.array_equal(told[0], told[1], equal_nan=True):
+            return  # it goes another way each time, as is found elsewhere
+        most, known = 1e-6 * np.maximum(np.abs(told[0]), 1.0), np.isfinite(told[0])
+        if not (np.abs(told[2] - told[0]) <= most).all(where=known):
+            what = names[0] if names else "something that no attribute holds"
+            how = "let reset() set it back"
+            if what.startswith("NormalizeObservation"):
+                how = "load its statistics (obs_rms) and set update_running_mean = False where it is made"
+            raise BadInput(
+                f"{spec.name} changes from episode to episode: what is observed or done depends on {what}, "
+                f"which outlasts resets, and here each episode is played by a new environment; {how}"
+            )
+        seen = [] if any(seen[0].report[1:3]) else [one for run in runs for one in islice(run, 1)]
 
 
 def check_told(spec: EnvironmentSpec) -> None:

@@ -99,24 +99,29 @@ def check_observations(about: Mapping[str, Any], task: Task, on_policy: bool, n_
 def check_model(model: Any, task: Task) -> None:
     """Raises `BadInput` unless a model of SB3, if it is one, was trained on plain observations."""
     normalizer = getattr(model, "get_vec_normalize_env", lambda: None)()
-    original = getattr(model, "_last_original_obs", None)
+    last, original = (getattr(model, f"_last_{name}", None) for name in ("obs", "original_obs"))
     normalized: bool | None = normalizer is not None and normalizer.norm_obs
-    if getattr(model, "get_env", lambda: None)() is None and original is not None:
-        # A loaded model has no environment; it has kept what its last one observed.
-        last, before = (_observations(found, task) for found in (model._last_obs, original))
-        normalized, on_policy = None, hasattr(model, "rollout_buffer")
-        if last is not None and before is not None:
-            normalized = _normalized(last, before, _Possible(task), on_policy, 1)
+    if normalizer is None and original is not None:
+        # Its environment may be another one than that of its training. What the last one there observed is
+        # kept, unless it was loaded with an environment, or was given one.
+        on_policy, found = hasattr(model, "rollout_buffer"), _observations(original, task)
+        plain, normalized = _observations(last, task), None
+        if plain is not None and found is not None:
+            normalized = _normalized(plain, found, _Possible(task), on_policy, 1)
+            if normalized is None and getattr(model, "get_env", lambda: None)() is not None:
+                normalized = False  # it has been trained in that, and goes on there
     if normalized:
         raise BadInput(
             "the model was trained under VecNormalize, and would be asked about plain observations: give its "
             "zip with vecnormalize=, or an object that normalises as its training did and asks the model"
         )
     if normalized is None:
+        how = "without an environment, or with" if last is None else "with"
+        how += " the VecNormalize of its training"
         raise BadInput(
             "nothing in the model tells whether it was trained on observations that VecNormalize normalised, "
-            "or whether that normalised rewards alone, if anything: load it with the environment of its "
-            'training, as load(path, env=env), or give its zip with vecnormalize="none" if it saw plain ones'
+            f"or whether that normalised rewards alone, if anything: load it {how}, as load(path, env=env), "
+            'or give its zip with vecnormalize="none" if it saw plain ones'
         )
 
 
