@@ -33,7 +33,9 @@ def check_draws(instance: Instance, resets: Resets, met: np.ndarray) -> str:
     """
     description, name = instance.spec.description, instance.name
     options, pinned, seed = description.reset, description.pinned, description.seed
-    names = _drawn(instance, resets) + _of_robot(instance, resets.states, met)
+    names = _drawn(instance, resets)
+    kept = instance.spec.found.get("kept", "").partition(", as ")[0]
+    names += (own := _of_robot(instance, resets.states, met))
     changed = _changed_by_user(instance) if options or pinned else set()
     if options and not changed:
         draws = f", which draws {', '.join(names)}" if names else ""
@@ -50,7 +52,6 @@ def check_draws(instance: Instance, resets: Resets, met: np.ndarray) -> str:
             f"each reset of {name} draws {', '.join(left[:8])}, and what is to be done depends on it: pin it"
             f', {how}, or as the reset with a seed draws it as {{"seed": 0}}'
         )
-    kept = instance.spec.found.get("kept", "").partition(", as ")[0]
     if instance.draws_globally and (left or kept):
         raise BadInput(
             f"each reset of {name} draws {', '.join(left[:8]) or kept} from a global generator of NumPy or "

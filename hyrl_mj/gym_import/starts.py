@@ -20,7 +20,7 @@ import numpy as np
 from hyrl_mj.errors import BadInput
 from hyrl_mj.gym_import.coordinates import robot_of
 from hyrl_mj.gym_import.fingerprint import differing
-from hyrl_mj.gym_import.instance import Instance
+from hyrl_mj.gym_import.instance import Instance, Seen
 from hyrl_mj.gym_import.specification import EnvironmentSpec
 from hyrl_mj.gym_import.trials import EPISODES
 from hyrl_mj.gym_import.uses import held, numbers_of
@@ -257,8 +257,9 @@ def _check_following(spec: EnvironmentSpec, resets: Resets) -> None:
         for name, owner, key in held(usual.inner, {}):
             if (put := _equal_to(place, numbers_of(owner[key]))) is not None:
                 of_memory[name.removeprefix("attribute ")] = put
-    reach = _terms(spec, model, _starts(spec, rng))
-    for state in _starts(spec, rng):
+    starts = _starts(spec, rng)
+    reach = _terms(spec, model, starts) if drawn else starts[:, spec.places]
+    for i, state in enumerate(starts):
         here = _terms(spec, model, state[None])[0] if drawn else state[spec.places]
         moved = state.copy()
         if of_state is not None:
@@ -268,54 +269,85 @@ def _check_following(spec: EnvironmentSpec, resets: Resets) -> None:
         elif not drawn:
             usual.reset()
             moved = _setpoints(usual, spec.state, state)
-        what = [names[i] for i in np.flatnonzero(moved != state)]
-        if not what and not of_memory:
+            for kind in ("mocap_pos", "userdata"):
+                put_to = _equal_to(spec.state[spec.places], state[columns[kind]])
+                if put_to is not None:
+                    moved[columns[kind]] = put_to(here)
+        what = [*of_memory, *(names[i] for i in np.flatnonzero(moved != state))]
+        if not what:
             return
-        inputs = [usual.drawn(rng)] * spec.max_steps
+        usual = _renewed(usual)
+        ours = _played(usual, state, [usual.drawn(rng)] * spec.max_steps)
+        if usual.physics.depth(spec.solid) > spec.depth and len(ours) == 1:
+            continue
         values = {name: predict(here) for name, predict in of_memory.items()}
-        trials = [(moved, values, inputs)]
-        if of_memory:  # so far that limits on it show
-            at = reach if drawn else _starts(spec, rng)[:, spec.places]
-            far = {n: 3 * np.ptp([p(t) for t in at], axis=0) for n, p in of_memory.items()}
-            for sign in (1, -1):
-                changed = {n: values[n] + sign * far[n] for n in values}
-                trials.append((state, changed, inputs[:NATURAL]))
-        for start, noted, of_run in trials:
-            _compare_noted(usual, other, (state, start), noted, of_run, [*of_memory, *what])
+        other = _compare_noted(other, ours, moved, values, what)
+        if not of_memory or i >= EPISODES // 2:
+            continue
+        far = {n: 3 * np.ptp([p(t) for t in reach], axis=0) for n, p in of_memory.items()}
+        for sign in (1, -1):  # so far that limits on it show
+            changed = {n: values[n] + sign * far[n] for n in values}
+            other = _compare_noted(other, ours[:NATURAL], state, changed, [*of_memory])
+
+
+def _renewed(instance: Instance) -> Instance:
+    """Returns an instance that can play another run: itself, or a new one if something outlasts its resets."""
+    instance.noted = None
+    worn = instance.spec.anew or instance.renew()
+    return Instance(instance.spec) if worn else instance
+
+
+# What is seen, and the inputs (m,) that go on from there.
+Sample = tuple[Seen, np.ndarray]
+
+
+def _played(instance: Instance, start: np.ndarray, inputs: list[np.ndarray]) -> list[Sample]:
+    """Returns the samples of a run from a start (S,) to its end; one alone if that is inside of something."""
+    none, found = np.zeros((len(inputs) + 1, instance.spec.dimension)), list[Sample]()
+    for seen, u in zip(instance.play(start, inputs, none), [*inputs, inputs[-1]], strict=True):
+        found.append((seen, u))
+        inside = instance.physics.depth(instance.spec.solid) > instance.spec.depth
+        if any(seen.report[1:3]) or (len(found) == 1 and inside):
+            break
+    return found
 
 
 def _compare_noted(
-    usual: Instance,
     other: Instance,
-    starts: tuple[np.ndarray, np.ndarray],
+    ours: list[Sample],
+    start: np.ndarray,
     noted: dict[str, np.ndarray],
-    inputs: list[np.ndarray],
     what: list[str],
-) -> None:
-    """Raises `BadInput` if a run goes otherwise where what a reset noted is set to other values, by name."""
-    spec = usual.spec
-    none = np.zeros((len(inputs) + 1, spec.dimension))
+) -> Instance:
+    """Plays a run from a start (S,) where what a reset noted has other values, and returns what played it.
+
+    Args:
+        other: plays it, or a new one.
+        ours: the samples of the run where all is as the reset has left it.
+        start: MuJoCo's state (S,).
+        noted: the values (k,), by name.
+        what: the names of all that is changed, for the message.
+
+    Raises:
+        BadInput: it goes otherwise.
+    """
+    spec, other = other.spec, _renewed(other)
     other.noted = lambda: _set(other, noted)
-    ours, theirs = usual.play(starts[0], inputs, none), other.play(starts[1], inputs, none)
-    k, differs = 0, False
-    for k, pair in enumerate(_both(ours, theirs)):
-        if pair is None:
-            differs = True
-            break
-        if not k and usual.physics.depth(spec.solid) > spec.depth:
-            return
-        # The first reward after a start is of what shapes it, and it alone is not judged by.
+    inputs = [u for _, u in ours[:-1]]
+    theirs = other.play(start, inputs, np.zeros((len(ours), spec.dimension)))
+    for k, (seen, _) in enumerate(ours):
+        try:
+            pair = seen, next(theirs)
+        except BadInput:  # it fails with values that it does not know
+            raise _not_its_own(spec, what) from None
+        # The first reward after a start is of what shapes it, and alone it is not judged by.
         first = 0 if "reward" in spec.criterion.asked or k > 1 else 1
         a, b = (
-            np.concatenate([spec.z(s.state[None])[0], s.observation, s.report[first:]])
-            for s in pair
+            np.concatenate([s.state[spec.places], s.observation, s.report[first:]]) for s in pair
         )
-        if differs := not np.array_equal(a, b, equal_nan=True):
-            break
-        if any(pair[0].report[1:3]):
-            break
-    if differs:
-        raise _not_its_own(spec, what)
+        if not np.array_equal(a, b, equal_nan=True):
+            raise _not_its_own(spec, what)
+    return other
 
 
 def _set(instance: Instance, noted: dict[str, np.ndarray]) -> None:
@@ -346,25 +378,11 @@ def _like(old: Any, numbers: list[Any]) -> Any:
     return type(old)(numbers.pop(0))
 
 
-def _both(ours: Iterator[Any], theirs: Iterator[Any]) -> Iterator[Any]:
-    """Yields pairs of samples; None where one of the runs fails at values that it does not know."""
-    while True:
-        try:
-            yield next(ours), next(theirs)
-        except StopIteration:
-            return
-        except BadInput:
-            yield None
-            return
-
-
 def _not_its_own(spec: EnvironmentSpec, what: list[str]) -> BadInput:
-    one_place = not any(b > a for a, b in zip(spec.start_low, spec.start_high, strict=True))
-    or_reset = "" if spec.description.starts == "reset" or one_place else " or give starts='reset'"
     return BadInput(
         f"reset() of {spec.name} notes where it leads to ({', '.join(what[:4])}), and step() goes by that, so "
-        f"a start elsewhere on the chart is none of its own: let the first step() note it,{or_reset} where "
-        "each reset leads to one place"
+        "a start elsewhere on the chart is none of its own: let the first step() note it, or give "
+        "starts='reset' if all resets lead to one place"
     )
 
 
@@ -378,6 +396,7 @@ def _check_led(spec: EnvironmentSpec) -> None:
     first = 0 if "reward" in spec.criterion.asked else 1  # of the report, by which it is judged
     for state in _starts(spec, rng):
         inputs = [usual.drawn(rng)] * spec.max_steps
+        usual, led = map(_renewed, (usual, led))
         ours, theirs = (one.play(state, inputs, none) for one in (usual, led))
         next(ours)
         with _leading(led, state):
@@ -432,6 +451,7 @@ def _check_natural(spec: EnvironmentSpec, resets: Resets) -> None:
             continue
         inputs = [usual.drawn(rng)] * n
         seen = natural.goes_on(inputs, none[1:])
+        usual = _renewed(usual)
         other = usual.play(state, inputs, none)
         next(other)
         for k, (a, b) in enumerate(zip(seen, other, strict=True)):

@@ -282,8 +282,8 @@ def _run(
     def tamper(rest: tuple[Any, ...]) -> tuple[Any, ...]:
         new = {} if changes is None else changes[len(told)]
         info = dict(rest[-1])
-        held = held(instance.inner, info)
-        told.append({name: copy.deepcopy(owner[key]) for name, owner, key in held})
+        places = held(instance.inner, info)
+        told.append({name: copy.deepcopy(owner[key]) for name, owner, key in places})
         for name, owner, key in [*held(instance.inner, info)] if new else ():
             if name in new:
                 owner[key] = copy.deepcopy(new[name])
