@@ -517,7 +517,7 @@ def test_another_environment_does_not_make_a_normalised_model_plain(algorithm, c
     given = algorithm.load(tmp_path / "model.zip", device="cpu")
     given.set_env(plain)
     for found in (given, algorithm.load(tmp_path / "model.zip", env=plain, device="cpu")):
-        with pytest.raises(BadInput, match="nothing in the model tells .* load it without"):
+        with pytest.raises(BadInput, match=r"nothing in the model tells .* load it without"):
             from_callable(found, circle)
 
 

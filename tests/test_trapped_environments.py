@@ -31,7 +31,6 @@ TWO = {
     ("sticky success", "recalled input or observation"): 2,
     ("rare attribute", "wrapper order"): 0,
     ("stale fields", "order of a Dict"): 1,
-    ("outlives resets", "smoothing"): 2,
     ("frames and filters", "success and collision terminate"): 0,
 }
 PAIRED = [name for pair in TWO for name in pair]

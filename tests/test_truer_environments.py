@@ -621,7 +621,7 @@ SOURCES = {
 }
 
 
-@pytest.mark.parametrize("make, draw", SOURCES.values(), ids=SOURCES)
+@pytest.mark.parametrize(("make", "draw"), SOURCES.values(), ids=SOURCES)
 def test_random_numbers_in_steps_are_noticed_whoever_draws_them(make, draw):
     kind = type("Drawing", (Rough,), {"make": make, "draw": draw})
     with pytest.raises(BadInput, match=r"draws random numbers in step\(\) \((source|a global)"):
@@ -632,7 +632,8 @@ def test_generators_that_nobody_draws_from_are_like_any_memory():
     makes = [make for name, (make, _) in SOURCES.items() if name != "system"]
     values = {"make": lambda self: [make(self) for make in makes], "draws": False}
     found = from_gymnasium(type("Holding", (Rough,), values)).specification
-    assert found.memoryless and "episodes" not in found.found
+    assert found.memoryless
+    assert "episodes" not in found.found
 
 
 class Hidden(array.array):
@@ -687,7 +688,8 @@ def test_what_would_be_handed_on_otherwise_is_refused(make, given, message):
 def test_clipped_actions_have_the_limits_within():
     wrapped = lambda: FlattenObservation(ClipAction(Puck()))  # noqa: E731
     task = from_gymnasium(wrapped, steps=60)
-    assert ends(task) == plain() and task.input_limits[1].tolist() == [4.0, 4.0]
+    assert ends(task) == plain()
+    assert task.input_limits[1].tolist() == [4.0, 4.0]
 
 
 class Slow(Puck):
@@ -759,9 +761,7 @@ def test_sensors_that_measure_late_or_in_a_small_place_are_refused():
     with pytest.raises(
         BadInput, match=r"observation\[\d\] of Tag is not .* step\(\) has stored it"
     ):
-        task = from_gymnasium(Tag, steps=60)
-        agent = from_callable(lambda o: np.full((len(o), 2), 4.0), task)
-        simulate(task, agent, np.array([[1.2, 0.9]]), Noise("uniform", 0.02))
+        from_gymnasium(Tag, steps=60)  # runs with noise come there
 
 
 def test_what_is_remembered_apart_from_the_place_is_observed_under_noise():

@@ -237,7 +237,8 @@ def _parts(value: Any, path: str, found: Fingerprint, depth: int) -> dict[str, A
     passed = "_ezpickle_args", "_ezpickle_kwargs", "_saved_kwargs", "step", "reset"
     left_out = passed if depth == 0 else ()
     own = {name: part for name, part in vars(value).items() if name not in left_out}
-    if _has_more(type(value)):
+    kind: Any = type(value)
+    if _has_more(kind):
         try:
             slots = {**(slots or {}), "()": value.__reduce_ex__(2)[1:3]}
         except Exception:  # it cannot be written down
@@ -248,7 +249,7 @@ def _parts(value: Any, path: str, found: Fingerprint, depth: int) -> dict[str, A
 @cache
 def _has_more(kind: type) -> bool:
     """Returns whether objects of a class keep something beside attributes, as those of C do."""
-    pointers = (kind.__dictoffset__ > 0) + (kind.__weakrefoffset__ > 0)  # type: ignore[attr-defined]
+    pointers = (kind.__dictoffset__ > 0) + (kind.__weakrefoffset__ > 0)
     slots = len(copyreg._slotnames(kind))  # type: ignore[attr-defined]
     return kind.__basicsize__ > object.__basicsize__ + 8 * (pointers + slots)
 

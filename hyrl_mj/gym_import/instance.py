@@ -454,7 +454,7 @@ class Instance:
         return seen
 
     def recalls(self, fresh: Instance, state: np.ndarray) -> np.ndarray:
-        """Returns which columns (o,) it observes in a state (S,) otherwise than one that has only been reset."""
+        """Returns which columns (o,) it observes in a state (S,) otherwise than one that was only reset."""
         seen = self.seen_as("now", state, np.zeros(self.spec.dimension))
         fresh.physics.write(state)
         usual = flat(fresh.watched(), self.inner.observation_space)

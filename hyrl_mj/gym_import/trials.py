@@ -102,7 +102,7 @@ def _rounds(off: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def check_observer(instance: Instance) -> np.ndarray:
-    """Returns `recalled` of a spec; raises `BadInput` if more than these columns depend on the way to a state.
+    """Returns `recalled` of a spec; raises `BadInput` if other columns depend on the way to a state.
 
     Runs under the same inputs are put into one state. What they observe there has to be the same to the bit:
     what is stored on the way differs, if only by rounding.

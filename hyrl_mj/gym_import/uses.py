@@ -97,7 +97,8 @@ def check_use(spec: EnvironmentSpec) -> None:
     for state in spec.state_at(spec.anywhere(rng, EPISODES)):
         wrapped.reset()
         wrapped.arrive(state)
-        if not all([one.put(state) for one in (true, noisy)]):  # both, whose resets are as many
+        clear = [one.put(state) for one in (true, noisy)]  # both, so that they are reset as often
+        if not all(clear):
             continue
         for k in range(min(SAMPLES, spec.max_steps)):
             if k % HELD == 0:
@@ -154,15 +155,15 @@ def check_episodes(spec: EnvironmentSpec) -> None:
     Each episode is played by an environment that is like new, and its user's goes on with what it remembers.
     """
     rng, none = np.random.default_rng(13), np.zeros((SAMPLES + 1, spec.dimension))
-    everyone = new, twin, old = [Instance(spec) for _ in range(3)]
+    new, twin, old = (Instance(spec) for _ in range(3))
     inputs = [new.drawn(rng) for _ in range(SAMPLES)]
     for _ in range(3):
         old.reset()
         for _ in old.wander(rng, SAMPLES, HELD):
             pass
-    runs = [one.play(spec.state, inputs, none) for one in everyone]
+    runs = [one.play(spec.state, inputs, none) for one in (new, twin, old)]
     seen = [next(run) for run in runs]
-    remembered = [one.memory() for one in everyone]
+    remembered = [one.memory() for one in (new, twin, old)]
     usual = {*differing(*remembered[:2])}  # such as names of files
     names = [name for name in differing(remembered[2], remembered[0]) if name not in usual]
     if drawn := [name for name in names if name in remembered[0].generators]:
