@@ -92,7 +92,8 @@ def resets_of(instance: Instance) -> Resets:
                 of_part = numbers.setdefault(name, dict.fromkeys(range(RESETS), usual))
                 of_part[seed] = part.ravel().astype(float)
         for name, owner, key in held(instance.inner, {}):
-            numbers.setdefault(name.removeprefix("attribute "), {})[seed] = numbers_of(owner[key])
+            if (found := numbers_of(owner[key])) is not None:
+                numbers.setdefault(name.removeprefix("attribute "), {})[seed] = found
     tables = {
         name: np.array([*rows.values()])
         for name, rows in numbers.items()
@@ -255,7 +256,8 @@ def _check_following(spec: EnvironmentSpec, resets: Resets) -> None:
         usual.reset()
         place = spec.state[spec.places]
         for name, owner, key in held(usual.inner, {}):
-            if (put := _equal_to(place, numbers_of(owner[key]))) is not None:
+            numbers = numbers_of(owner[key])
+            if numbers is not None and (put := _equal_to(place, numbers)) is not None:
                 of_memory[name.removeprefix("attribute ")] = put
     starts = _starts(spec, rng)
     reach = _terms(spec, model, starts) if drawn else starts[:, spec.places]
@@ -456,7 +458,7 @@ def _check_natural(spec: EnvironmentSpec, resets: Resets) -> None:
         next(other)
         for k, (a, b) in enumerate(zip(seen, other, strict=True)):
             # Wrappers may have seen another first observation, where the reset shows what is not up to date.
-            values = [
+            here, there = (
                 np.concatenate(
                     [
                         one.state[spec.places],
@@ -465,8 +467,8 @@ def _check_natural(spec: EnvironmentSpec, resets: Resets) -> None:
                     ]
                 )
                 for one in (a, b)
-            ]
-            if not np.allclose(*values, rtol=SAME, atol=SAME, equal_nan=True):
+            )
+            if not np.allclose(here, there, rtol=SAME, atol=SAME, equal_nan=True):
                 raise BadInput(
                     f"a run of {spec.name} that begins at the place where the reset with seed {seed} leads "
                     f"to goes otherwise after {k + 1} sample(s) than that reset has it go: something that a "
