@@ -149,8 +149,8 @@ def _of_robot(instance: Instance, states: np.ndarray, met: np.ndarray) -> list[s
         return names
     _keep(
         instance,
-        f"{', '.join(names[:8])} of the robot, which resets draw, as the reset that runs begin with leaves it, "
-        f"at rest; over what they draw, no trial ends elsewhere by more than {APART:.0%} of what runs reach",
+        f"{', '.join(names[:8])} of the robot, which resets draw, as the reset that runs begin with leaves "
+        f"it, at rest; over what they draw, no trial ends elsewhere by more than {APART:.0%} of what runs reach",
     )
     return []
 
