@@ -35,7 +35,7 @@ def check_draws(instance: Instance, resets: Resets, met: np.ndarray) -> str:
     options, pinned, seed = description.reset, description.pinned, description.seed
     names = _drawn(instance, resets)
     kept = instance.spec.found.get("kept", "").partition(", as ")[0]
-    names += (own := _of_robot(instance, resets.states, met))
+    names += _of_robot(instance, resets.states, met)
     changed = _changed_by_user(instance) if options or pinned else set()
     if options and not changed:
         draws = f", which draws {', '.join(names)}" if names else ""
