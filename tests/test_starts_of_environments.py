@@ -107,7 +107,7 @@ class FenceByDistance(Fence):
         return bool(np.linalg.norm(self.data.qpos[:2] - GOAL) > self.most + 1.0)
 
 
-class FenceByRegion(Fence):
+class FenceByRegion(At):
     """It notes in which region of the room it began."""
 
     def begin(self, place):
@@ -224,7 +224,12 @@ class Pushed(At):
 
 @pytest.mark.parametrize(
     ("make", "name"),
-    [(Fault, "sign"), (Weak, "actuator_gainprm of its model"), (Lucky, "luck"), (Heading, r"qpos\[2\]")]
+    [
+        (Fault, "sign"),
+        (Weak, "actuator_gainprm of its model"),
+        (Lucky, "luck"),
+        (Heading, r"qpos\[2\]"),
+    ]
     + [(Pushed, r"qvel\[0\], qvel\[1\]")],
 )
 def test_rare_draws_and_those_of_the_robot_have_to_be_pinned(make, name):
@@ -233,9 +238,13 @@ def test_rare_draws_and_those_of_the_robot_have_to_be_pinned(make, name):
 
 
 def test_small_noise_of_resets_is_said():
-    for base, what, name in ((Pushed, {"speed": 0.01}, "qvel[0]"), (Heading, {"spread": 0.01}, "qpos[2]")):
+    for base, what, name in (
+        (Pushed, {"speed": 0.01}, "qvel[0]"),
+        (Heading, {"spread": 0.01}, "qpos[2]"),
+    ):
         task = from_gymnasium(type("Small", (base,), what), steps=20)
-        assert f"{name}" in task.found["kept"] and "of the robot" in task.found["kept"]
+        assert name in task.found["kept"]
+        assert "of the robot" in task.found["kept"]
     assert from_gymnasium(Heading, pinned={"qpos[2]": 0.0}, steps=20).max_steps == 20
 
 
