@@ -15,8 +15,8 @@ from hyrl_mj.gym_import.trials import EPISODES, HELD, SAMPLES
 
 # Resets whose runs are compared, beside those that bring rare values.
 COMPARED = 4
-# Of what resets draw of the robot: how much of what runs reach is wide, and by how much of it the ends of runs
-# may differ.
+# Of what resets draw of the robot: how much of what runs reach is wide, and by how much of it the ends of
+# runs may differ.
 WIDE, APART = 1 / 3, 0.15
 
 
@@ -118,8 +118,8 @@ def _keep(instance: Instance, what: str) -> None:
 def _of_robot(instance: Instance, states: np.ndarray, met: np.ndarray) -> list[str]:
     """Returns the names of what resets draw of the robot outside of the chart, if runs depend on it much.
 
-    Runs are played from states that resets lead to, and from the same places with all that is not of the chart
-    as runs begin.
+    Runs are played from states that resets lead to, and from the same places with all that is not of the
+    chart as runs begin.
     """
     spec, physics = instance.spec, instance.physics
     own = own_of(spec, instance.model)
@@ -149,8 +149,9 @@ def _of_robot(instance: Instance, states: np.ndarray, met: np.ndarray) -> list[s
         return names
     _keep(
         instance,
-        f"{', '.join(names[:8])} of the robot, which resets draw, as the reset that runs begin with leaves it, "
-        f"velocities 0; over what they draw, no trial ends elsewhere by more than {APART:.0%} of what runs reach",
+        f"{', '.join(names[:8])} of the robot, which resets draw, as the reset that runs begin with "
+        f"leaves it, velocities 0; over what they draw, no trial ends elsewhere by more than {APART:.0%} of what runs "
+        "reach",
     )
     return []
 

@@ -305,8 +305,8 @@ def _learn_bounds(instance: Instance, met: np.ndarray, begun: np.ndarray) -> Non
     lead = ", ".join(f"{n} {a:.3g} to {b:.3g}" for n, a, b in zip(names, *ends, strict=True))
     found["starts"] = (
         "all over the chart, the robot at rest and all else as after a reset (deeper than "
-        f"{spec.depth:.2g} m inside of something it has crashed); with 'reset' between the places to which 64 "
-        f"resets lead, at rest, too, and all else as after the reset with seed {given.seed or 0}: {lead}"
+        f"{spec.depth:.2g} m inside of something it has crashed); with 'reset' between the places to which "
+        f"64 resets lead, at rest, too, and all else as after the reset with seed {given.seed or 0}: {lead}"
     )
     if not np.ptp(begun, axis=0).any():
         found["starts"] += (

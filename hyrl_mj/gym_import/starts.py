@@ -120,7 +120,7 @@ def own_of(spec: EnvironmentSpec, model: mujoco.MjModel) -> np.ndarray:
 
 
 def _terms(spec: EnvironmentSpec, model: mujoco.MjModel, states: np.ndarray) -> np.ndarray:
-    """Returns the terms (n, t) of which what follows from the place of the robot is a sum, of states (n, S)."""
+    """Returns terms (n, t), of which what follows from the robot's place is a sum, of states (n, S)."""
     z = spec.z(states)
     own = [i for i in own_of(spec, model) if i in spec.qpos and i not in spec.places]
     turns = [i for i, c in enumerate(spec.coordinates) if c.unit == "rad"]
@@ -230,8 +230,8 @@ def _check_equalities(spec: EnvironmentSpec, resets: Resets) -> None:
         if (off := _violation(instance)) > VIOLATED + 2 * resets.violation:
             raise BadInput(
                 f"equality constraints tie the robot of {spec.name} to something that stays where its reset "
-                f"leads to: at another start on the chart they are off by {off:.3g} m or rad. Leave them out, "
-                "or name a chart of what they tie together"
+                f"leads to: at another start on the chart they are off by {off:.3g} m or rad. Leave them "
+                "out, or name a chart of what they tie together"
             )
 
 
@@ -291,7 +291,7 @@ def _check_following(spec: EnvironmentSpec, resets: Resets) -> None:
 
 
 def _renewed(instance: Instance) -> Instance:
-    """Returns an instance that can play another run: itself, or a new one if something outlasts its resets."""
+    """Returns an instance that can play another run: a new one if something outlasts its resets."""
     instance.noted = None
     worn = instance.spec.anew or instance.renew()
     return Instance(instance.spec) if worn else instance
@@ -380,8 +380,8 @@ def _like(old: Any, numbers: list[Any]) -> Any:
 
 def _not_its_own(spec: EnvironmentSpec, what: list[str]) -> BadInput:
     return BadInput(
-        f"reset() of {spec.name} notes where it leads to ({', '.join(what[:4])}), and step() goes by that, so "
-        "a start elsewhere on the chart is none of its own: let the first step() note it, or give "
+        f"reset() of {spec.name} notes where it leads to ({', '.join(what[:4])}), and step() goes by that, "
+        "so a start elsewhere on the chart is none of its own: let the first step() note it, or give "
         "starts='reset' if all resets lead to one place"
     )
 
@@ -468,9 +468,9 @@ def _check_natural(spec: EnvironmentSpec, resets: Resets) -> None:
             ]
             if not np.allclose(*values, rtol=SAME, atol=SAME, equal_nan=True):
                 raise BadInput(
-                    f"a run of {spec.name} that begins at the place where the reset with seed {seed} leads to "
-                    f"goes otherwise after {k + 1} sample(s) than that reset has it go: something that a reset "
-                    "sets to where it leads to stays elsewhere, and no attribute tells what. Let the first "
+                    f"a run of {spec.name} that begins at the place where the reset with seed {seed} leads "
+                    f"to goes otherwise after {k + 1} sample(s) than that reset has it go: something that a "
+                    "reset sets to where it leads to stays elsewhere, and no attribute tells what. Let the first "
                     "step() note it"
                 )
             if any(a.report[1:3]):
