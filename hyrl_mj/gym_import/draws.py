@@ -150,8 +150,8 @@ def _of_robot(instance: Instance, states: np.ndarray, met: np.ndarray) -> list[s
     _keep(
         instance,
         f"{', '.join(names[:8])} of the robot, which resets draw, as the reset that runs begin with "
-        f"leaves it, velocities 0; over what they draw, no trial ends elsewhere by more than {APART:.0%} of what runs "
-        "reach",
+        f"leaves it, velocities 0; over what they draw, no trial ends elsewhere by more than "
+        f"{APART:.0%} of what runs reach",
     )
     return []
 

@@ -469,8 +469,8 @@ def _check_natural(spec: EnvironmentSpec, resets: Resets) -> None:
             if not np.allclose(*values, rtol=SAME, atol=SAME, equal_nan=True):
                 raise BadInput(
                     f"a run of {spec.name} that begins at the place where the reset with seed {seed} leads "
-                    f"to goes otherwise after {k + 1} sample(s) than that reset has it go: something that a "
-                    "reset sets to where it leads to stays elsewhere, and no attribute tells what. Let the first "
+                    f"to goes otherwise after {k + 1} sample(s) than that reset has it go: "
+                    "something that a reset sets to where it leads to stays elsewhere, and no attribute tells what. Let the first "
                     "step() note it"
                 )
             if any(a.report[1:3]):
