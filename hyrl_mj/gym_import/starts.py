@@ -470,7 +470,8 @@ def _check_natural(spec: EnvironmentSpec, resets: Resets) -> None:
                 raise BadInput(
                     f"a run of {spec.name} that begins at the place where the reset with seed {seed} leads "
                     f"to goes otherwise after {k + 1} sample(s) than that reset has it go: "
-                    "something that a reset sets to where it leads to stays elsewhere, and no attribute tells what. Let the first "
+                    "something that a reset sets to where it leads to stays elsewhere, and no attribute tells "
+                    "what. Let the first "
                     "step() note it"
                 )
             if any(a.report[1:3]):
