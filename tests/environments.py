@@ -178,7 +178,7 @@ class Moved(Puck):
         gym.Env.reset(self, seed=seed)
         self.goal = (options or {}).get("rock", self.np_random.uniform(-0.3, 0.3))
         self.model.geom_pos[0, 1] = self.goal
-        return super().reset(seed=seed)
+        return super().reset()  # with another number of the same generator
 
 
 class Gambling(Puck):

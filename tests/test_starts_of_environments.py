@@ -1,0 +1,277 @@
+"""Starts on the chart: nothing that a reset sets to the place it leads to stays elsewhere without a word."""
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from environments import GOAL, XML, Puck
+
+from hyrl_mj import BadInput, from_gymnasium
+
+pytestmark = pytest.mark.slow  # a second for each environment
+PLACE = np.array([-1.3, 0.5])
+MOTORS = XML[XML.index("<actuator>") + 10 : XML.index("</actuator>")]
+SERVOS = "".join(
+    f'<{{kind}} name="to_{axis}" joint="{axis}" kp="20" {{limit}}="-3 3"/>' for axis in "xy"
+)
+
+
+class At(Puck):
+    """Each reset leads to one place, or draws it; what else it sets to it is of the classes below."""
+
+    xml, draws = XML, True
+
+    def __init__(self):
+        super().__init__()
+        self.model = mujoco.MjModel.from_xml_string(self.xml)
+        self.data = mujoco.MjData(self.model)
+
+    def reset(self, *, seed=None, options=None):
+        gym.Env.reset(self, seed=seed)
+        mujoco.mj_resetData(self.model, self.data)
+        place = self.np_random.uniform((-1.8, -1.2), (-1.0, 1.2)) if self.draws else PLACE
+        self.begin(place)
+        self.data.qpos[:2] = place
+        mujoco.mj_forward(self.model, self.data)
+        return self._get_obs(), {}
+
+    def begin(self, place):
+        pass
+
+    def _get_obs(self):
+        place = self.data.qpos[:2].copy()
+        return {"position": place, "velocity": self.data.qvel[:2].copy(), "to_goal": GOAL - place}
+
+    def step(self, action):
+        self.control(np.clip(action, -4, 4))
+        mujoco.mj_step(self.model, self.data, nstep=5)
+        off = float(np.linalg.norm(self.data.qpos[:2] - GOAL))
+        return self._get_obs(), -off, self.crashed(), False, {"success": off < 0.25}
+
+    def control(self, action):
+        self.data.ctrl[:] = action
+
+    def crashed(self):
+        return False
+
+
+class Setpoint(At):
+    """Its actions move the setpoints of servos."""
+
+    xml = XML.replace(MOTORS, SERVOS.format(kind="position", limit="ctrlrange"))
+
+    def begin(self, place):
+        self.data.ctrl[:] = place
+
+    def control(self, action):
+        self.data.ctrl[:] += 0.02 * action
+
+
+class Centred(Setpoint):
+    """Its only place is zero, where nothing in the numbers tells a setpoint."""
+
+    draws = False
+
+    def begin(self, place):
+        place[:] = [0.0, 1.0]
+        super().begin(place)
+
+
+class Integrated(At):
+    xml = XML.replace(MOTORS, SERVOS.format(kind="intvelocity", limit='ctrlrange="-1 1" actrange'))
+    draws = False
+
+    def begin(self, place):
+        self.data.act[:] = place
+
+
+class Fence(At):
+    def begin(self, place):
+        self.home = place.copy()
+
+    def crashed(self):
+        return bool(np.linalg.norm(self.data.qpos[:2] - self.home) > 3.4)
+
+
+class FenceAtOnePlace(Fence):
+    draws = False
+
+
+class FenceByDistance(Fence):
+    """It notes how far the goal was, and crashes farther away from it."""
+
+    def begin(self, place):
+        self.most = float(np.linalg.norm(place - GOAL))
+
+    def crashed(self):
+        return bool(np.linalg.norm(self.data.qpos[:2] - GOAL) > self.most + 1.0)
+
+
+class FenceByRegion(At):
+    """It notes in which region of the room it began."""
+
+    def begin(self, place):
+        self.region = int(place[1] > 0)
+
+    def control(self, action):
+        super().control(action * (1 if self.region else 0.8))
+
+
+class FenceByMarker(Fence):
+    """It notes its place in the model."""
+
+    def begin(self, place):
+        self.model.site_pos[0, :2] = place
+
+    def crashed(self):
+        return bool(np.linalg.norm(self.data.qpos[:2] - self.model.site_pos[0, :2]) > 3.4)
+
+
+class Tied(At):
+    """A load hangs on it."""
+
+    xml = XML.replace(
+        "</worldbody>",
+        '<body name="load" pos="0 0 0.1"><freejoint/><geom size="0.05" contype="0" conaffinity="0"/></body>'
+        '</worldbody><equality><weld body1="load" body2="puck"/></equality>',
+    )
+    draws = False
+
+    def begin(self, place):
+        self.data.qpos[2:4] = place
+
+
+@pytest.mark.parametrize(
+    ("make", "given", "message"),
+    [
+        (Setpoint, {"seed": 0}, r"notes where it leads to \(ctrl\[0\], ctrl\[1\]\)"),
+        (Centred, {}, r"notes where it leads to \(ctrl\[0\], ctrl\[1\]\)"),
+        (Integrated, {}, r"notes where it leads to \(act\[0\], act\[1\]\)"),
+        (Fence, {"seed": 0}, r"notes where it leads to \(home\)"),
+        (Fence, {"seed": 0, "starts": "reset"}, r"notes where it leads to \(home\)"),
+        (FenceAtOnePlace, {}, r"notes where it leads to \(home\)"),
+        (FenceByDistance, {"seed": 0}, r"notes where it leads to \(most\)"),
+        (FenceByRegion, {}, "draws region|goes otherwise after"),
+        (FenceByMarker, {"seed": 0}, r"notes where it leads to \(site_pos of its model\)"),
+        (Tied, {"chart": {"x": "x", "y": "y"}}, "equality constraints tie the robot of Tied"),
+    ],
+)
+def test_what_stays_at_the_place_of_the_reset_is_refused(make, given, message):
+    with pytest.raises(BadInput, match=message):
+        from_gymnasium(make, steps=60, **given)
+
+
+def test_one_place_may_be_noted_where_runs_begin_there_alone():
+    assert from_gymnasium(FenceAtOnePlace, starts="reset", steps=5).max_steps == 5
+    found = from_gymnasium(type("OnePlace", (At,), {"draws": False}), steps=5).found
+    assert "one place, so no reset shows" in found["starts"]
+
+
+# ---- draws
+
+
+class Fault(At):
+    """One reset in ten reverses the motors."""
+
+    def begin(self, place):
+        self.sign = -1 if self.np_random.random() > 0.9 else 1
+
+    def control(self, action):
+        super().control(self.sign * action)
+
+
+class Weak(At):
+    """One reset in ten weakens the motors, in the model."""
+
+    def begin(self, place):
+        self.model.actuator_gainprm[:, 0] = 0.1 if self.np_random.random() > 0.9 else 1.0
+
+
+class Lucky(Fault):
+    """It is told by a number, of which only the largest do something."""
+
+    def begin(self, place):
+        self.luck = self.np_random.random()
+
+    def control(self, action):
+        At.control(self, -action if self.luck > 0.93 else action)
+
+
+class Heading(At):
+    """It pushes along its own axes, and its heading is drawn."""
+
+    xml = XML.replace(
+        '<geom type="sphere"', '<joint name="yaw" axis="0 0 1" damping="2"/><geom type="sphere"'
+    )
+    spread = np.pi
+
+    def begin(self, place):
+        self.data.qpos[2] = self.np_random.uniform(-self.spread, self.spread)
+
+    def control(self, action):
+        c, s = np.cos(self.data.qpos[2]), np.sin(self.data.qpos[2])
+        super().control(np.array([[c, -s], [s, c]]) @ action)
+
+
+class Pushed(At):
+    """Resets draw its velocity."""
+
+    speed = 3.0
+
+    def begin(self, place):
+        self.data.qvel[:2] = self.np_random.uniform(-self.speed, self.speed, 2)
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        (Fault, "sign"),
+        (Weak, "actuator_gainprm of its model"),
+        (Lucky, "luck"),
+        (Heading, r"qpos\[2\]"),
+    ]
+    + [(Pushed, r"qvel\[0\], qvel\[1\]")],
+)
+def test_rare_draws_and_those_of_the_robot_have_to_be_pinned(make, name):
+    with pytest.raises(BadInput, match=f"draws {name}, and what is to be done depends on it"):
+        from_gymnasium(make, starts="reset", steps=20)
+
+
+def test_small_noise_of_resets_is_said():
+    for base, what, name in (
+        (Pushed, {"speed": 0.01}, "qvel[0]"),
+        (Heading, {"spread": 0.01}, "qpos[2]"),
+    ):
+        task = from_gymnasium(type("Small", (base,), what), steps=20)
+        assert name in task.found["kept"]
+        assert "of the robot" in task.found["kept"]
+    assert from_gymnasium(Heading, pinned={"qpos[2]": 0.0}, steps=20).max_steps == 20
+
+
+# ---- what is honest
+
+
+class Shaped(At):
+    """Its reward is how much closer it comes."""
+
+    def begin(self, place):
+        self.before = float(np.linalg.norm(place - GOAL))
+
+    def step(self, action):
+        observation, reward, *rest = super().step(action)
+        gained, self.before = self.before + reward, -reward
+        return observation, gained, *rest
+
+
+class Servo(At):
+    """Its actions are the setpoints."""
+
+    xml, draws = Setpoint.xml, False
+
+    def begin(self, place):
+        self.data.ctrl[:] = place
+
+
+@pytest.mark.parametrize(("make", "given"), [(Shaped, {"seed": 0}), (Servo, {})])
+def test_what_matters_to_no_run_is_accepted(make, given):
+    assert from_gymnasium(make, steps=20, **given).max_steps == 20
