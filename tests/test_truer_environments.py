@@ -314,7 +314,10 @@ class Proximity(Puck):
     observation_space = spaces.Dict(
         {**Puck.observation_space.spaces, "proximity": spaces.Box(0, 1, (1,))}
     )
-    proximity = 1.0
+
+    def reset(self, **options):
+        self.proximity = 1.0
+        return super().reset(**options)
 
     def step(self, action):
         result = super().step(action)
