@@ -229,8 +229,8 @@ class Pushed(At):
         (Weak, "actuator_gainprm of its model"),
         (Lucky, "luck"),
         (Heading, r"qpos\[2\]"),
-    ]
-    + [(Pushed, r"qvel\[0\], qvel\[1\]")],
+        (Pushed, r"qvel\[0\], qvel\[1\]"),
+    ],
 )
 def test_rare_draws_and_those_of_the_robot_have_to_be_pinned(make, name):
     with pytest.raises(BadInput, match=f"draws {name}, and what is to be done depends on it"):
