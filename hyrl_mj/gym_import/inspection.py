@@ -101,10 +101,10 @@ def inspect(description: Description, untried: bool = False) -> tuple[Pool, Inst
         instance.learn(sensing=senses(instance.spec))
     check_noted(instance.spec, resets)
     pool.spec = instance.spec
-    moves, affine = trials.moving(pool)
+    moves, at_rest = trials.moving(pool)
     trials.check_instances(pool)
     memoryless = pool.spec.memoryless and trials.goes_on(pool)
-    pool.spec = replace(pool.spec, moves=moves, affine=affine, memoryless=memoryless)
+    pool.spec = replace(pool.spec, moves=moves, at_rest=at_rest, memoryless=memoryless)
     instance = Instance(pool.spec)
     instance.reset()
     return pool, instance

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from itertools import combinations
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -191,7 +192,7 @@ class EnvironmentSpec:
         sensing: whether wrappers read MuJoCo's state for what they observe, and see it under noise.
         anew: whether a reset changes what the next one does to a wrapper: each episode takes a new instance.
         moves: (o,) bool, the columns of an observation at rest that follow the chart.
-        affine: a matrix (d + 1, o) that gives what is observed at rest at z from (z, 1), if one does.
+        at_rest: a matrix (t, o) that gives what is observed at rest at z from `terms` of z, if one does.
         found: what was filled in, with the reason, by name.
     """
 
@@ -229,7 +230,7 @@ class EnvironmentSpec:
     sensing: bool = False
     anew: bool = False
     moves: np.ndarray = field(default_factory=_none)
-    affine: np.ndarray | None = None
+    at_rest: np.ndarray | None = None
     found: dict[str, str] = field(default_factory=dict)
 
     @property
@@ -270,6 +271,13 @@ class EnvironmentSpec:
     def z(self, state: np.ndarray) -> np.ndarray:
         """Returns the chart points (n, d) of MuJoCo's states (n, S)."""
         return state[:, self.places] + self.offset
+
+    def terms(self, z: np.ndarray) -> np.ndarray:
+        """Returns terms (n, t) of chart points (n, d), of which much that follows the place is a sum."""
+        turns = [i for i, c in enumerate(self.coordinates) if c.unit == "rad"]
+        waves = [wave(z[:, i]) for i in turns for wave in (np.sin, np.cos)]
+        products = [a * b for a, b in combinations(waves, 2)]
+        return np.column_stack([np.ones(len(z)), z, (z**2).sum(axis=1), *waves, *products])
 
     def state_at(self, z: np.ndarray) -> np.ndarray:
         """Returns MuJoCo's states (n, S) in which runs begin at chart points (n, d)."""

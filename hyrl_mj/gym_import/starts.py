@@ -11,7 +11,6 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import combinations
 from typing import Any
 
 import mujoco
@@ -122,13 +121,9 @@ def own_of(spec: EnvironmentSpec, model: mujoco.MjModel) -> np.ndarray:
 
 def _terms(spec: EnvironmentSpec, model: mujoco.MjModel, states: np.ndarray) -> np.ndarray:
     """Returns the terms (n, t), of states (n, S), that what follows from the robot's place is a sum of."""
-    z = spec.z(states)
     own = [i for i in own_of(spec, model) if i in spec.qpos and i not in spec.places]
-    turns = [i for i, c in enumerate(spec.coordinates) if c.unit == "rad"]
-    waves = [wave(z[:, i]) for i in turns for wave in (np.sin, np.cos)]
-    products = [a * b for a, b in combinations(waves, 2)]
     others = [states[:, own]] if len(own) < RESETS // 2 else []
-    return np.column_stack([np.ones(len(z)), z, (z**2).sum(axis=1), *waves, *products, *others])
+    return np.column_stack([spec.terms(spec.z(states)), *others])
 
 
 Predict = Callable[[np.ndarray], np.ndarray]

@@ -230,9 +230,9 @@ class EnvironmentTask(Task):
         d = self.chart.dimension
         changed, found = np.flatnonzero((measured[:, :d] != z).any(axis=1)), measured.copy()
         if len(changed):
-            affine, z_now = self.specification.affine, z[changed]
-            one = np.column_stack([z_now, np.ones(len(z_now))])
-            seen = self._begun(z_now)[0] if affine is None else one @ affine
+            at_rest, z_now = self.specification.at_rest, z[changed]
+            known = at_rest is not None
+            seen = self.specification.terms(z_now) @ at_rest if known else self._begun(z_now)[0]
             moves = d + np.flatnonzero(self.specification.moves)
             found[changed[:, None], moves] = seen[:, self.specification.moves]
             found[changed, :d] = z_now

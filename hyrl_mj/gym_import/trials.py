@@ -193,14 +193,13 @@ def derived_of(instance: Instance) -> tuple[Derived, list[int]]:
 
 
 def moving(pool: Pool) -> tuple[np.ndarray, np.ndarray | None]:
-    """Returns which columns of an observation at rest follow the chart (o,) bool, and `affine` of a spec."""
-    spec = pool.spec
-    z = spec.anywhere(np.random.default_rng(0), EPISODES * (spec.dimension + 1))
+    """Returns which columns of an observation at rest follow the chart (o,) bool, and `at_rest` of a spec."""
+    spec, rng = pool.spec, np.random.default_rng(0)
+    z = spec.anywhere(rng, EPISODES * spec.terms(spec.anywhere(rng, 1)).shape[1])
     seen, depths = pool.scatter("rest", spec.state_at(z))
     check_finite(spec.name, seen[depths <= spec.depth])
-    one = np.column_stack([z, np.ones(len(z))])
-    fit = np.linalg.lstsq(one, seen, rcond=None)[0]
-    exact = _rounds(np.abs(one @ fit - seen), seen).all()
+    fit = np.linalg.lstsq(terms := spec.terms(z), seen, rcond=None)[0]
+    exact = _rounds(np.abs(terms @ fit - seen), seen).all()
     return np.ptp(seen, axis=0) > 0, fit if exact else None
 
 
