@@ -263,6 +263,15 @@ def test_hysteresis_wins_all_that_can_be_won_with_its_own_start_mode(on_vehicle)
     assert (own(game, "ideal", 0.1)[region] < NEVER).all()
 
 
+def test_where_nothing_can_be_won_nothing_is_won(on_vehicle, monkeypatch):
+    game, _ = on_vehicle
+    winnable = game.winnable
+    monkeypatch.setattr(game, "winnable", lambda eps: winnable(eps) & (eps < 0.06))
+    assert game.score("ideal", 0.05).won == 1
+    assert game.score("ideal", 0.1).won == 0
+    assert game.margin("ideal") < 0.06
+
+
 def test_hysteresis_loses_from_the_wrong_start_mode_where_noise_hides_it(on_vehicle):
     # Mode 1 (right) does not let go of y in (0, overlap + eps), and has no room left there.
     game, _ = on_vehicle

@@ -150,7 +150,7 @@ class Game:
 
         def all_won(cells: int) -> bool:
             own = self.value(name, cells * cell)[-1, :-2]
-            return bool((own[self.starts & self.winnable(cells * cell)] < NEVER).all())
+            return share(own[self.starts & self.winnable(cells * cell)] < NEVER) == 1
 
         last = int(self.largest / cell + 1e-6)
         low, high = (min(round(eps / cell), last) for eps in near or (0.0, self.largest))
@@ -180,8 +180,8 @@ class Game:
 
 
 def share(won: np.ndarray) -> float:
-    """Returns the share of (n,) bool that is true; 1 if n is 0."""
-    return float(won.mean()) if len(won) else 1.0
+    """Returns the share of (n,) bool that is true; 0 if n is 0, because nothing is won where nothing can be."""
+    return float(won.mean()) if len(won) else 0.0
 
 
 def worst_signal(
