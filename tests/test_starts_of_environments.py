@@ -141,9 +141,65 @@ class Tied(At):
         self.data.qpos[2:4] = place
 
 
+class Home(At):
+    """Each reset leads to its home, as those of Gymnasium's own environments do."""
+
+    home, draws, key = (0.0, 1.0), False, False
+
+    def __init__(self):
+        super().__init__()
+        self.init_qpos = np.array(self.home)
+
+    def reset(self, *, seed=None, options=None):
+        gym.Env.reset(self, seed=seed)
+        mujoco.mj_resetData(self.model, self.data)
+        if self.key:
+            mujoco.mj_resetDataKeyframe(self.model, self.data, 0)
+        else:
+            self.data.qpos[:] = self.init_qpos
+        self.begin(self.data.qpos[:2].copy())
+        mujoco.mj_forward(self.model, self.data)
+        return self._get_obs(), {}
+
+
+class HomeInAClosure(Home):
+    """Nothing but a variable of a function holds where it began."""
+
+    def begin(self, place):
+        self.away = lambda now: float(np.linalg.norm(now - place))
+
+    def crashed(self):
+        return self.away(self.data.qpos[:2]) > 1.0
+
+
+class HomeOfWholeNumbers(HomeInAClosure):
+    """It notes one coordinate, which is 1."""
+
+    def begin(self, place):
+        self.line = float(place[1])
+
+    def crashed(self):
+        return abs(self.data.qpos[1] - self.line) > 1.0
+
+
+class HomeOfAKey(HomeOfWholeNumbers):
+    xml = XML.replace("</mujoco>", '<keyframe><key qpos="0 1"/></keyframe></mujoco>')
+    key = True
+
+
+class Posture(Home):
+    """It stays near a posture, which is where resets lead to, wherever it began."""
+
+    def crashed(self):
+        return float(np.linalg.norm(self.data.qpos[:2] - self.init_qpos)) > 3.0
+
+
 @pytest.mark.parametrize(
     ("make", "given", "message"),
     [
+        (HomeInAClosure, {}, "goes otherwise after"),
+        (HomeOfWholeNumbers, {}, "goes otherwise after"),
+        (HomeOfAKey, {}, "goes otherwise after"),
         (Setpoint, {"seed": 0}, r"notes where it leads to \(ctrl\[0\], ctrl\[1\]\)"),
         (Centred, {}, r"notes where it leads to \(ctrl\[0\], ctrl\[1\]\)"),
         (Integrated, {}, r"notes where it leads to \(act\[0\], act\[1\]\)"),
@@ -272,6 +328,6 @@ class Servo(At):
         self.data.ctrl[:] = place
 
 
-@pytest.mark.parametrize(("make", "given"), [(Shaped, {"seed": 0}), (Servo, {})])
+@pytest.mark.parametrize(("make", "given"), [(Shaped, {"seed": 0}), (Servo, {}), (Posture, {})])
 def test_what_matters_to_no_run_is_accepted(make, given):
     assert from_gymnasium(make, steps=20, **given).max_steps == 20

@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import mujoco
@@ -196,6 +197,19 @@ def _equal_to(place: np.ndarray, table: np.ndarray) -> Callable[[np.ndarray], np
     return put
 
 
+def _is_set_by_reset(spec: EnvironmentSpec, name: str, other: np.ndarray) -> bool:
+    """Returns whether a reset gives an attribute its numbers, where it holds other ones (k,) before."""
+    instance = Instance(spec)
+    instance.reset()
+    usual = instance.memory()
+    _set(instance, {name: other})
+    try:
+        instance.reset()
+    except BadInput:  # it cannot, from there
+        return True
+    return name not in differing(instance.memory(), usual)
+
+
 # ---- the trials
 
 
@@ -208,9 +222,7 @@ def check_noted(spec: EnvironmentSpec, resets: Resets) -> None:
     _check_equalities(spec, resets)
     _check_following(spec, resets)
     _check_led(spec)
-    drawn = np.ptp(spec.z(resets.states), axis=0).any()
-    if drawn and "goal" not in spec.found:
-        _check_natural(spec, resets)
+    _check_natural(spec, resets)
 
 
 def _starts(spec: EnvironmentSpec, rng: np.random.Generator) -> np.ndarray:
@@ -251,9 +263,11 @@ def _check_following(spec: EnvironmentSpec, resets: Resets) -> None:
         usual.reset()
         place = spec.state[spec.places]
         for name, owner, key in held(usual.inner, {}):
+            name = name.removeprefix("attribute ")
             numbers = numbers_of(owner[key])
-            if numbers is not None and (put := _equal_to(place, numbers)) is not None:
-                of_memory[name.removeprefix("attribute ")] = put
+            put = None if numbers is None else _equal_to(place, numbers)
+            if put is not None and _is_set_by_reset(spec, name, put(place + 1.0)):
+                of_memory[name] = put
     starts = _starts(spec, rng)
     reach = _terms(spec, model, starts) if drawn else starts[:, spec.places]
     for i, state in enumerate(starts):
@@ -430,6 +444,40 @@ def _leading(instance: Instance, state: np.ndarray) -> Iterator[None]:
         mujoco.mj_forward = own
 
 
+def _naturals(spec: EnvironmentSpec, resets: Resets) -> Iterator[Instance]:
+    """Yields new instances whose own resets lead to other places.
+
+    These are drawn, or the home that resets go by (as `init_qpos`, or a keyframe) is moved to places on the
+    chart, and moved back after the reset.
+    """
+    if np.ptp(spec.z(resets.states), axis=0).any() and "goal" not in spec.found:
+        for seed in range(1, 1 + EPISODES // 2):
+            natural = Instance(spec)
+            natural.reset(seed)
+            yield natural
+    at = [c.index for c in spec.coordinates if c.kind == "qpos"]
+    places = spec.places[[c.kind == "qpos" for c in spec.coordinates]]
+    count = len(_homes(Instance(spec)))
+    for i, state in product(range(count), _starts(spec, np.random.default_rng(12))[: EPISODES // 2]):
+        natural = Instance(spec)
+        home, by = _homes(natural)[i], state[places] - spec.state[places]
+        old = home.copy()
+        home[..., at] += by
+        natural.reset()
+        home[...] = old
+        if np.allclose(natural.physics.read()[places], state[places], rtol=SAME, atol=SAME):
+            yield natural
+
+
+def _homes(instance: Instance) -> list[np.ndarray]:
+    """Returns the arrays (nq,) of numbers in attributes that can be written, and the keyframes (nkey, nq)."""
+    values = (owner[key] for _, owner, key in held(instance.inner, {}))
+    nq = instance.model.nq
+    arrays = (a for a in values if isinstance(a, np.ndarray) and a.shape == (nq,))
+    homes = [a for a in arrays if a.dtype.kind == "f" and a.flags.writeable]
+    return [*homes, instance.model.key_qpos][: len(homes) + min(instance.model.nkey, 1)]
+
+
 def _check_natural(spec: EnvironmentSpec, resets: Resets) -> None:
     """Raises `BadInput` if a run that a reset begins goes otherwise than one that is put to the same place.
 
@@ -439,9 +487,7 @@ def _check_natural(spec: EnvironmentSpec, resets: Resets) -> None:
     own = np.append(own_of(spec, usual.model), usual.physics.columns["warmstart"])
     n = min(NATURAL, spec.max_steps)
     none = np.zeros((n + 1, spec.dimension))
-    for seed in range(1, 1 + EPISODES // 2):
-        natural = Instance(spec)
-        natural.reset(seed)
+    for natural in _naturals(spec, resets):
         state = spec.state.copy()
         state[own] = natural.physics.read()[own]
         if natural.physics.depth(spec.solid) > spec.depth:
@@ -451,6 +497,7 @@ def _check_natural(spec: EnvironmentSpec, resets: Resets) -> None:
         usual = _renewed(usual)
         other = usual.play(state, inputs, none)
         next(other)
+        noted = differing(natural.memory(), usual.memory())
         for k, (a, b) in enumerate(zip(seen, other, strict=True)):
             # Wrappers may have seen another first observation, where the reset shows what is not up to date.
             here, there = (
@@ -465,10 +512,10 @@ def _check_natural(spec: EnvironmentSpec, resets: Resets) -> None:
             )
             if not np.allclose(here, there, rtol=SAME, atol=SAME, equal_nan=True):
                 raise BadInput(
-                    f"a run of {spec.name} that begins at the place where the reset with seed {seed} leads "
-                    f"to goes otherwise after {k + 1} sample(s) than that reset has it go: something that a "
-                    "reset sets to where it leads to stays elsewhere, and no attribute tells what. Let the "
-                    "first step() note it"
+                    f"a run of {spec.name} that begins where another reset leads to goes otherwise after "
+                    f"{k + 1} sample(s) than that reset has it go: what resets set to where they lead to stays "
+                    f"elsewhere ({', '.join(noted[:4]) or 'no attribute tells what'}). Let the first step() "
+                    "note it, or give starts='reset' if all resets lead to one place"
                 )
             if any(a.report[1:3]):
                 break
