@@ -458,7 +458,9 @@ def _naturals(spec: EnvironmentSpec, resets: Resets) -> Iterator[Instance]:
     at = [c.index for c in spec.coordinates if c.kind == "qpos"]
     places = spec.places[[c.kind == "qpos" for c in spec.coordinates]]
     count = len(_homes(Instance(spec)))
-    for i, state in product(range(count), _starts(spec, np.random.default_rng(12))[: EPISODES // 2]):
+    for i, state in product(
+        range(count), _starts(spec, np.random.default_rng(12))[: EPISODES // 2]
+    ):
         natural = Instance(spec)
         home, by = _homes(natural)[i], state[places] - spec.state[places]
         old = home.copy()
@@ -511,11 +513,12 @@ def _check_natural(spec: EnvironmentSpec, resets: Resets) -> None:
                 for one in (a, b)
             )
             if not np.allclose(here, there, rtol=SAME, atol=SAME, equal_nan=True):
+                told = ", ".join(noted[:4]) or "no attribute tells what"
                 raise BadInput(
                     f"a run of {spec.name} that begins where another reset leads to goes otherwise after "
-                    f"{k + 1} sample(s) than that reset has it go: what resets set to where they lead to stays "
-                    f"elsewhere ({', '.join(noted[:4]) or 'no attribute tells what'}). Let the first step() "
-                    "note it, or give starts='reset' if all resets lead to one place"
+                    f"{k + 1} sample(s) than that reset has it go: what resets set to where they lead to "
+                    f"stays elsewhere ({told}). Let the first step() note it, or give "
+                    "starts='reset' if all resets lead to one place"
                 )
             if any(a.report[1:3]):
                 break

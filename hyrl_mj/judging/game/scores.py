@@ -180,7 +180,7 @@ class Game:
 
 
 def share(won: np.ndarray) -> float:
-    """Returns the share of (n,) bool that is true; 0 if n is 0, because nothing is won where nothing can be."""
+    """Returns the share of (n,) bool that is true; 0 if n is 0, as nothing is won where nothing can be."""
     return float(won.mean()) if len(won) else 0.0
 
 
