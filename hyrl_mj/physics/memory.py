@@ -92,10 +92,15 @@ def late_sensor(model: mujoco.MjModel) -> str:
     for i, name in enumerate(mjcf.names(model, mujoco.mjtObj.mjOBJ_SENSOR)):
         period, delay = float(model.sensor_interval[i].max()), float(model.sensor_delay[i])
         if period > 0 or delay > 0:
-            does = f"holds its value for {period:g} s" if period > 0 else f"is {delay:g} s late"
+            does, part = (
+                (f"holds its value for {period:g} s", "hold")
+                if period > 0
+                else (f"is {delay:g} s late", "delay")
+            )
             return (
                 f"sensor {name} of {mjcf.model_name(model)} {does}, and the true state is taken from the "
-                "sensors: leave out its interval and delay"
+                "sensors: leave out its interval and delay, and say in the task what its sensors do, as "
+                f"sensor = '{part} 2' for two samples"
             )
         if noise := float(model.sensor_noise[i]):
             return (
