@@ -22,6 +22,7 @@ from hyrl_mj import BadInput, Noise
 from hyrl_mj.gym_export.core import BatchedEnv, Domain
 from hyrl_mj.gym_export.gym_env import TaskEnv
 from hyrl_mj.gym_export.sb3_env import TaskVecEnv
+from hyrl_mj.policies import PolicyController
 
 LEFT, AHEAD, RIGHT = 4, 2, 0
 IDS = {"unit_circle": "hyrl_mj/UnitCircle-v0", "vehicle": "hyrl_mj/ObstacleAvoidance-v0"}
@@ -202,6 +203,32 @@ def test_an_action_that_is_no_level_is_refused(action):
     env.reset(seed=0)
     with pytest.raises(BadInput, match=str(action)):
         env.step(action)
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_the_loop_of_a_controller_is_that_of_simulate(name):
+    task = hyrl_mj.get_task(name)
+
+    def one_way(observation):
+        n = len(observation)
+        return np.full(n, LEFT) if task.input_levels is not None else np.ones((n, 1))
+
+    policy, z = hyrl_mj.from_callable(one_way, task), task.starts(1, np.random.default_rng(0))
+    controller, env = PolicyController(policy), make(name)
+    _, info = env.reset(options={"z": z[0]})
+    q, path = controller.initial_mode(info["measured"]), [info["z"]]
+    while "outcome" not in info:
+        u, q = controller.step(q, info["measured"])
+        *_, info = env.step(u[0])
+        path.append(info["z"])
+    arc = hyrl_mj.simulate(task, policy, z[0])
+    np.testing.assert_array_equal(np.array(path), arc.z)
+
+    envs = make_vec(name, 3, noise=Noise("uniform", 0.1))
+    _, infos = envs.reset(seed=0)
+    u, _ = controller.step(np.zeros(3, dtype=int), infos["measured"])
+    seen, *_, infos = envs.step(u)
+    np.testing.assert_array_equal(seen, task.observation(infos["measured"]).astype(np.float32))
 
 
 def test_actions_beyond_the_limits_are_clipped():

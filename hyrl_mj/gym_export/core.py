@@ -99,6 +99,7 @@ class BatchedEnv:
         self.max_steps = limit or task.max_steps
         self.plant = task.plant(n, threads)
         self.samples = np.zeros(n, dtype=int)  # of each episode so far
+        self.measured = np.zeros_like(self.plant.measurement)  # what observations are computed from
         self.seed(None)
 
     def seed(self, seed: int | None) -> None:
@@ -170,7 +171,9 @@ class BatchedEnv:
         return self.task.z(self.plant.measurement)
 
     def inputs(self, actions: ArrayLike) -> np.ndarray:
-        """Returns inputs (n, m) in the plant's units for levels (n,) int, or for inputs (n, m) to clip.
+        """Returns inputs (n, m) in the plant's units, for levels (n,) int or for inputs (n, m) of a controller.
+
+        The latter are clipped to their limits.
 
         Raises:
             BadInput: actions of another shape or type, or numbers of no level.
@@ -180,22 +183,26 @@ class BatchedEnv:
         except ValueError:
             raise BadInput(f"actions {actions!r} cannot be used: give an array") from None
         discrete, m = self.task.input_levels is not None, len(self.task.inputs)
-        fits = values.ndim == 1 if discrete else values.ndim == 2 and values.shape[1] == m
+        is_input = values.ndim == 2 and values.shape[1] == m
+        is_input &= not discrete or values.dtype.kind == "f"
+        fits = is_input or (discrete and values.ndim == 1)
         if not fits or not values.size or values.dtype.kind not in "iuf":
-            one = "an integer" if discrete else f"an array of shape ({m},)"
+            one = "an integer, or floats" if discrete else "an array"
+            one += f" of shape ({m},)"
             raise BadInput(
                 f"actions of shape {values.shape} and type {values.dtype} cannot be used: {self.task.name} "
                 f"takes {one} for each episode"
             )
-        if discrete:
+        if not is_input:
             return at_levels(self.task, values)
         return np.clip(values.astype(float), *self.task.input_limits)
 
     def _measure(self, ids: np.ndarray) -> np.ndarray:
-        """Returns noisy measurements (k, p) of the rows `ids`."""
+        """Returns noisy measurements (k, p) of the rows `ids`, which `measured` holds from then on."""
         true, modes = self.plant.truth(ids), np.full(len(ids), NOT_STARTED)
         noise = drawn(self._noise, Sample(ids, self.samples[ids], true, modes, self.plant))
-        return self.plant.observe(true, noise, ids)
+        self.measured[ids] = self.plant.observe(true, noise, ids)
+        return self.measured[ids]
 
 
 def cautious_reward(

@@ -37,8 +37,9 @@ def action_space(task: Task) -> spaces.Space[Any]:
 class TaskEnv(gym.Env[np.ndarray, Any]):
     """One episode of a task, for `gymnasium.make`.
 
-    `info["z"]` is the true chart point (d,). When an episode is over, `info["outcome"]` is "reached",
-    "crashed", "out_of_bounds" or "stalled", and `info["is_success"]` whether it is "reached".
+    `info["measured"]` (1, p) is the noisy measurement of which the observation is made, as controllers take
+    it. An action may also be the input (m,) that a controller gives. `info["z"]` is the true chart point
+    (d,). When an episode is over, `info["outcome"]` is "reached", "crashed", "out_of_bounds" or "stalled", and `info["is_success"]` whether it is "reached".
 
     `model` and `data` are MuJoCo's, as in environments of Gymnasium's own: who writes to the data moves it.
 
@@ -86,19 +87,22 @@ class TaskEnv(gym.Env[np.ndarray, Any]):
         self.core.seed(int(self.np_random.integers(2**63)))
         observation = self.core.reset(z=starts(self.core.task, options))[0]
         self._show()
-        return observation, {"z": self.core.z[0]}
+        return observation, self._info()
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Applies one action for one sample; see `gymnasium.Env.step`."""
         self._take()
         result = self.core.step(self.core.inputs([action]))
         self._show()
-        info: dict[str, Any] = {"z": self.core.z[0]}
+        info = self._info()
         if result.done[0]:
             info["outcome"] = Outcome(result.outcome[0]).label
             info["is_success"] = bool(result.outcome[0] == Outcome.REACHED)
         terminated, truncated = bool(result.terminated[0]), bool(result.truncated[0])
         return result.observation[0], float(result.reward[0]), terminated, truncated, info
+
+    def _info(self) -> dict[str, Any]:
+        return {"z": self.core.z[0], "measured": self.core.measured.copy()}
 
     def _get_obs(self) -> np.ndarray:
         """Returns the observation of the present state, as environments of Gymnasium's own have it."""
@@ -146,7 +150,8 @@ class TaskVectorEnv(VectorEnv):
     """n episodes of a task at once, for `gymnasium.make_vec` with the mode "vector_entry_point".
 
     Episodes that end restart in the same step: `infos["final_obs"]` holds their last
-    observations and `infos["final_info"]` their outcomes, both masked by `infos["_final_obs"]`.
+    observations and `infos["final_info"]` their outcomes, both masked by `infos["_final_obs"]`. What a
+    controller takes is `infos["measured"]` (n, p), and its inputs (n, m) may be actions.
 
     Args:
         task: name of the task, or a file of one that this machine has run before.
@@ -196,7 +201,7 @@ class TaskVectorEnv(VectorEnv):
         super().reset(seed=seed)
         if seed is not None:
             self.core.seed(seed)
-        return self.core.reset(z=starts(self.core.task, options)), {"z": self.core.z}
+        return self.core.reset(z=starts(self.core.task, options)), self._infos()
 
     def step(
         self, actions: np.ndarray
@@ -212,8 +217,11 @@ class TaskVectorEnv(VectorEnv):
             infos = self._add_info(infos, last, int(i))
         if len(ended):
             observation[ended] = self.core.reset(ended)
-        infos["z"] = self.core.z
+        infos |= self._infos()
         return observation, result.reward, result.terminated, result.truncated, infos
+
+    def _infos(self) -> dict[str, Any]:
+        return {"z": self.core.z, "measured": self.core.measured.copy()}
 
     def render(self) -> None:
         """Returns None: many episodes at once draw no pictures."""
