@@ -171,7 +171,7 @@ class BatchedEnv:
         return self.task.z(self.plant.measurement)
 
     def inputs(self, actions: ArrayLike) -> np.ndarray:
-        """Returns inputs (n, m) in the plant's units, for levels (n,) int or for inputs (n, m) of a controller.
+        """Returns inputs (n, m) in the plant's units, for levels (n,) int or inputs (n, m) of a controller.
 
         The latter are clipped to their limits.
 

@@ -39,7 +39,8 @@ class TaskEnv(gym.Env[np.ndarray, Any]):
 
     `info["measured"]` (1, p) is the noisy measurement of which the observation is made, as controllers take
     it. An action may also be the input (m,) that a controller gives. `info["z"]` is the true chart point
-    (d,). When an episode is over, `info["outcome"]` is "reached", "crashed", "out_of_bounds" or "stalled", and `info["is_success"]` whether it is "reached".
+    (d,). When an episode is over, `info["outcome"]` is "reached", "crashed", "out_of_bounds" or "stalled",
+    and `info["is_success"]` whether it is "reached".
 
     `model` and `data` are MuJoCo's, as in environments of Gymnasium's own: who writes to the data moves it.
 
