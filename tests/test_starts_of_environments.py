@@ -194,9 +194,20 @@ class Posture(Home):
         return float(np.linalg.norm(self.data.qpos[:2] - self.init_qpos)) > 3.0
 
 
+class Ahead(Home):
+    """Its goal lies ahead of its home."""
+
+    def begin(self, place):
+        self.goal = self.init_qpos[:2] + 1.0
+
+    def crashed(self):
+        return float(np.linalg.norm(self.data.qpos[:2] - self.goal)) > 3.0
+
+
 @pytest.mark.parametrize(
     ("make", "given", "message"),
     [
+        (Ahead, {}, r"stays elsewhere \(goal"),
         (HomeInAClosure, {}, "goes otherwise after"),
         (HomeOfWholeNumbers, {}, "goes otherwise after"),
         (HomeOfAKey, {}, "goes otherwise after"),
@@ -328,6 +339,11 @@ class Servo(At):
         self.data.ctrl[:] = place
 
 
-@pytest.mark.parametrize(("make", "given"), [(Shaped, {"seed": 0}), (Servo, {}), (Posture, {})])
+PINNED = {"pinned": {"goal": np.array([1.0, 2.0])}}
+
+
+@pytest.mark.parametrize(
+    ("make", "given"), [(Shaped, {"seed": 0}), (Servo, {}), (Posture, {}), (Ahead, PINNED)]
+)
 def test_what_matters_to_no_run_is_accepted(make, given):
     assert from_gymnasium(make, steps=20, **given).max_steps == 20

@@ -465,7 +465,10 @@ def _naturals(spec: EnvironmentSpec, resets: Resets) -> Iterator[Instance]:
         home, by = _homes(natural)[i], state[places] - spec.state[places]
         old = home.copy()
         home[..., at] += by
-        natural.reset()
+        try:
+            natural.reset()
+        except BadInput:  # it leads to no other places
+            continue
         home[...] = old
         if np.allclose(natural.physics.read()[places], state[places], rtol=SAME, atol=SAME):
             yield natural
@@ -517,8 +520,8 @@ def _check_natural(spec: EnvironmentSpec, resets: Resets) -> None:
                 raise BadInput(
                     f"a run of {spec.name} that begins where another reset leads to goes otherwise after "
                     f"{k + 1} sample(s) than that reset has it go: what resets set to where they lead to "
-                    f"stays elsewhere ({told}). Let the first step() note it, or give "
-                    "starts='reset' if all resets lead to one place"
+                    f"stays elsewhere ({told}). Let the first step() note it, pin it, or "
+                    "give starts='reset' if all resets lead to one place"
                 )
             if any(a.report[1:3]):
                 break
