@@ -26,6 +26,8 @@ STARTS = 32  # as training draws them
 EFFECT = 10
 # Number of the sample -> inputs (n, m).
 Inputs = Callable[[int], np.ndarray]
+# Indices (k,) of rows -> what a method gives for them (k, ...).
+OfRows = Callable[[np.ndarray], np.ndarray]
 
 
 def try_random(task: Task) -> np.ndarray:
@@ -71,16 +73,15 @@ def try_methods(task: Task) -> None:
     rng, before = np.random.default_rng(0), _attributes(task)
     z = np.vstack([task.starts(STARTS, rng), task.chart.draw(STARTS, rng)])
     measured, order = task.placed(z).measurement, rng.permutation(len(z))
-    for name in ("z", "observation", "ending", "verdict"):
-        method = getattr(task, name)
-        first = method(measured)
+    for name, asked in _methods(task, z, measured).items():
+        first = asked(every := np.arange(len(z)))
         shuffled = np.empty_like(first)
-        shuffled[order] = method(measured[order])
+        shuffled[order] = asked(order)
         alone = first.copy()
         for row in order[:STARTS]:
-            alone[row] = method(measured[[row]])[0]
-        for again in (shuffled, method(measured), alone):
-            same = np.isclose(again, first, rtol=0, atol=1e-9, equal_nan=True)
+            alone[row] = asked(np.array([row]))[0]
+        for again in (shuffled, asked(every), alone):
+            same = np.isclose(again, first, rtol=1e-9, atol=1e-9, equal_nan=True)
             if not same.all():
                 row = int(np.argwhere(~same)[0][0])
                 raise BadInput(
@@ -95,6 +96,27 @@ def try_methods(task: Task) -> None:
                 f"its methods change its attribute {name} when they are asked: a task remembers nothing, so "
                 "compute it from the measurement"
             )
+
+
+def _methods(task: Task, z: np.ndarray, measured: np.ndarray) -> dict[str, OfRows]:
+    """Returns the methods of a task by name, each of rows of chart points (n, d) or measurements (n, p)."""
+
+    def of_measured(name: str) -> OfRows:
+        return lambda rows: getattr(task, name)(measured[rows])
+
+    def state(rows: np.ndarray) -> np.ndarray:
+        return np.hstack([part for part in task.state(z[rows]) if part is not None])
+
+    names = ["z", "observation", "ending", "verdict"]
+    if type(task).plant is not Task.plant:  # an environment answers the rest by itself
+        return {name: of_measured(name) for name in names}
+    path = np.linspace(z, np.random.default_rng(0).permutation(z), 5)
+    names += ["danger"] if task.gives_direction else ["danger", "where"]
+    found = {name: of_measured(name) for name in names}
+    found |= {"state": state, "miss": lambda rows: task.miss(z[rows])}
+    if task.gives_direction:
+        found["direction"] = lambda rows: task.direction(path[:, rows])
+    return found
 
 
 def _attributes(task: Task) -> dict[str, Any]:
