@@ -185,30 +185,40 @@ def try_where(task: Task) -> None:
 
 
 def try_place(task: Task) -> None:
-    """Raises `BadInput` if the chart does not begin with the place of the tracked point, as where() takes it.
+    """Raises `BadInput` if where() does not give the place of the tracked point, or by default of the chart.
 
     Obstacles are at places of the world: in other units, or in another order, runs pass them on no side.
     """
     model, tracked = task.model, task.scene.tracked
     kinds = mujoco.mjtObj.mjOBJ_SITE, mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_GEOM
     named = any(mujoco.mj_name2id(model, kind, tracked) >= 0 for kind in kinds)
-    if type(task).where is not Task.where or type(task).plant is not Task.plant or not named:
+    if type(task).plant is not Task.plant or not named:
         return
     rng = np.random.default_rng(0)
-    z = task.chart.draw(STARTS, rng)
+    plant = task.placed(z := task.chart.draw(STARTS, rng), rng)
     where, number = mjcf.point_of(model, tracked)
     moves = np.flatnonzero(model.body_weldid[model.geom_bodyid] != 0)
     data, places, reach = mujoco.MjData(model), [], 0.0
-    for qpos in task.state(z, rng)[0]:
+    for qpos in plant.qpos:
         mjcf.place(model, data, qpos, task.mocap)
         place = getattr(data, where)[number]
         places.append(place[list(task.plane)].copy())
         far = np.linalg.norm(data.geom_xpos[moves] - place, axis=1) + model.geom_rbound[moves]
         reach = max(reach, float(far.max(initial=0.0)))
-    moved = np.ptp(places, axis=0)
-    off = task.where(task.placed(z).measurement) - places
+    moved, given = np.ptp(places, axis=0), task.where(plant.measurement)
+    off = np.abs(given - places).max(axis=1)
+    away = off.max() > (reach or np.inf)
+    if type(task).where is not Task.where:  # it may be another point of the robot
+        if away:
+            row = int(off.argmax())
+            raise BadInput(
+                f"where() gives {given[row].tolist()} at {task.chart.format(z[row])}, and {tracked} is at "
+                f"{places[row].tolist()} in the plane {task.plane} of the world, in metres: let it give the "
+                "place of the robot there, or name another point in scene.tracked"
+            )
+        return
     # A point may be off the middle of a robot that turns, but not off the robot.
-    if (np.ptp(off, axis=0) > moved / 2).any() or np.abs(off).max() > (reach or np.inf):
+    if away or (np.ptp(given - places, axis=0) > moved / 2).any():
         names = " and ".join(task.chart.names[:2])
         raise BadInput(
             f"its chart begins with {names}, and these are not the place of {tracked} in the plane "
