@@ -322,6 +322,15 @@ MISTAKES = {
     ),
     "starts the wrong way round": (PY, r"\(0\.0, -0\.8\)", "(0.0, 1.0)", r"start_low is greater"),
     "an unknown algorithm": (PY, "levels=5", 'levels=5, algorithm="sarsa"', r"algorithm 'sarsa'.*ppo, a2c"),
+    "an unknown field of the training": (
+        PY, "levels=5", 'levels=5, training={"sample": 9}', r"learning\.training .* 'sample'.*samples",
+    ),
+    "a value that a training cannot have": (
+        PY, "levels=5", 'levels=5, modes={"gamma": 2}', r"learning\.modes of my_robot: gamma",
+    ),
+    "more units than inputs": (
+        PY, r'\("m/s",\)', '("m/s", "m")', r"input_units has 2 value\(s\), and there are 1 input",
+    ),
     "dqn without levels": (PY, "levels=5", 'algorithm="dqn"', r"dqn needs levels"),
     "a mirror of the wrong length": (
         PY, r"\(1, -1, -1\)", "(1, -1)", r"mirror\.observation is \(1, -1\): give 3",

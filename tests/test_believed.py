@@ -213,3 +213,11 @@ def test_a_chart_that_begins_with_another_place_is_refused(edit, tmp_path):
         BadInput, match="begins with x and y, and these are not the place of tracked"
     ):
         check_task(task)
+
+
+@pytest.mark.parametrize("code", ["100 * measured[:, :2]", "measured[:, 1::-1]"])
+def test_places_that_are_not_on_the_robot_are_refused(code, tmp_path):
+    where = f"def where(self, measured):\n        return {code}\n\n    def miss"
+    task = changed(tmp_path, (PYTHON, "def miss", where))
+    with pytest.raises(BadInput, match=r"where\(\) gives .*, and tracked is at"):
+        check_task(task)

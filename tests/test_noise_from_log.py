@@ -1,13 +1,18 @@
 """The noise of a sensor is found in logs in which it was planted; what a log does not tell is said."""
 
+from copy import copy
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from command_line import call
 from PIL import Image
 from scipy import signal, stats
 
-from hyrl_mj import BadInput, noise_from_log
+from hyrl_mj import BadInput, from_callable, get_task, noise_from_log
 from hyrl_mj.files import logs
+from hyrl_mj.policies import PolicyController
+from hyrl_mj.simulation import LoopSettings, closed_loop, noise_of
 
 
 def moved(t, amplitude=1.0):
@@ -167,7 +172,8 @@ def test_at_rest_there_is_no_bias_and_no_delay(of):
 
 
 SAID = {
-    "moves too little for a delay": lambda log: log | {"x": log["x"] - log["x_ref"], "x_ref": 0 * log["t"]},
+    "moves too little or too evenly for a delay": lambda log: log
+    | {"x": log["x"] - log["x_ref"], "x_ref": 0 * log["t"]},
     "samples earlier than its reference": lambda log: log | {"x_ref": np.roll(log["x_ref"], 4)},
     "correlated from sample to sample": lambda log: log
     | {"x": log["x_ref"] + signal.lfilter([0.01], [1, -0.7], np.random.default_rng(0).normal(size=6000))},
@@ -353,3 +359,46 @@ def test_a_factor_is_a_number(factor, tmp_path):
         noise_from_log(
             write(tmp_path / "log.csv", planted(0, 0.05, uniform=0.1)), scale={"x": factor}
         )
+
+
+def test_a_constant_error_is_a_bias_and_no_turn(of):
+    log = planted(0, 0.05)
+    assert of(log | {"x": log["x_ref"] + 0.3}).text == "bias 0.3"
+    assert of(log | {"x": np.roll(log["x_ref"], 4)}).text == "delay 4"
+
+
+# ---- a log that is played
+
+
+def test_a_log_is_not_played_in_its_gaps(tmp_path):
+    log = planted(0, 0.05, uniform=0.05, seconds=60)
+    late = {name: np.concatenate([log[name], log[name] + 3_000 * (name == "t")]) for name in log}
+    noise = noise_of(task := get_task("unit_circle"), f"log {write_theta(tmp_path, late)}", 0.0)
+    at_rest = from_callable(lambda observation: np.zeros((len(observation), 1)), task)
+    runs = closed_loop(
+        task, PolicyController(at_rest), np.ones((50, 1)), noise,
+        settings=LoopSettings(20, record=True, quiet=True),
+    )  # fmt: skip
+    assert (np.ptp(runs.noise[:20, :, 0], axis=0) > 0.03).all()
+
+
+def test_angles_turn_in_a_log_as_in_the_chart(tmp_path):
+    degrees = copy(get_task("unit_circle"))
+    degrees.chart = replace(degrees.chart, low=(0.0,), high=(360.0,))
+    log = planted(0, 0.05, amplitude=100, uniform=5, bias=7)
+    log["x"] = log["x"] % 360
+    noise = noise_of(degrees, f"log {write_theta(tmp_path, log)}", 0.0)
+    assert (noise.bound, noise.columns[0].bias) == pytest.approx((12, 7), rel=0.02)
+
+
+def test_a_log_is_of_columns_that_are_those_of_the_chart(tmp_path, monkeypatch):
+    path = write_theta(tmp_path, planted(0, 0.05, uniform=0.05))
+    noise = noise_of(task := get_task("unit_circle"), f"log {path}", 0.0)
+    monkeypatch.setattr(type(task), "z", lambda self, measured: measured[:, :1] + 1)
+    with pytest.raises(BadInput, match="does not begin with its chart"):
+        noise.against(task, None)
+
+
+def write_theta(folder, log):
+    """Writes a log of theta."""
+    return write(folder / "log.csv", {k.replace("x", "theta"): v for k, v in log.items()})

@@ -24,6 +24,7 @@ import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, pipeline
 from hyrl_mj.files import artifacts
 from hyrl_mj.judging import Regions, episodes, noisy_episodes
+from hyrl_mj.judging.game import Comparison, EpisodeCount
 from hyrl_mj.learning import changed, preset
 from hyrl_mj.physics import mjcf
 from hyrl_mj.pipeline import cluster, report
@@ -174,15 +175,38 @@ def test_a_stranger_s_sweep_leads_nowhere_else(tmp_path):
         report(tmp_path)
 
 
-def test_the_least_share_of_episodes_may_be_none(circle):
+def test_shares_of_episodes_are_of_all_start_regions():
     counts = tuple(
-        hyrl_mj.judging.game.EpisodeCount(
-            "none", 0.1, False, "hyrl", region, 5, {}, reached, (0.0, 1.0)
+        EpisodeCount(
+            "none", 0.1, False, "hyrl", region, 5, {"reached": n, "crashed": 5 - n}, n / 5, (0, 1)
         )
-        for region, reached in (("near M*", 0.0), ("elsewhere", 0.8))
+        for region, n in (("near M*", 0), ("elsewhere", 4))
     )
     found = sweeps._figures(hyrl_mj.Robustness(0.1, False, None, counts, 0))
-    assert found == {"hyrl_reached_none": 0.0, "episodes_none": 5}
+    assert found == {"hyrl_reached_none": 0.4, "episodes_none": 10}
+
+
+def test_where_nothing_could_be_compared_nothing_is_withstood():
+    def found(compared, lost):
+        none, times = {"policy": 0, "hyrl": 0}, {"policy": (1.0, 1.0), "hyrl": (1.0, 1.0)}
+        one = Comparison(
+            "attack", 5, lost, compared, lost if compared else none, none, 0.0, (-1.0, 1.0), none,
+            times, times,
+        )  # fmt: skip
+        return sweeps._compared(hyrl_mj.Robustness(0.1, False, None, (), 0, comparisons=(one,)))
+
+    lost_without_noise = {"policy_lost_without_noise": 1, "hyrl_lost_without_noise": 0.2}
+    assert found(0, {"policy": 5, "hyrl": 1}) == lost_without_noise
+    some = found(3, {"policy": 3, "hyrl": 0})
+    assert (some["policy_withstood_attack"], some["hyrl_withstood_attack"]) == (0, 1)
+    assert "hyrl_late" in some
+    assert "policy_late" not in some, "no run arrives"
+
+
+def test_runs_without_a_figure_are_counted():
+    rows = [row(0, hyrl_margin=0.1), row(1, hyrl_margin=None), row(2, hyrl_margin=None)]
+    (*_, cells) = sweep_tables.summary_table(Sweep(Common("fast", None, {}), tuple(rows))).rows
+    assert cells == ["HyRL, margin", "0.1, none in 2 of 3 runs"]
 
 
 def test_without_ray_one_sentence_says_how_to_install_it(tmp_path):

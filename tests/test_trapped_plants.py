@@ -14,8 +14,8 @@ from hyrl_mj.judging.proof import why_no_cells
 from hyrl_mj.judging.proof.affine import Unbounded
 from hyrl_mj.judging.proof.assumptions import check_assumptions
 from hyrl_mj.sets import Grid
-from hyrl_mj.tasks import check_task
-from hyrl_mj.tasks.motion import begins_anew
+from hyrl_mj.tasks import check_task, trial
+from hyrl_mj.tasks.motion import begins_anew, stands_still
 
 # The seeds of robots with every trap once: seed k has the trap number k modulo their number.
 ROUNDS = [range(first, first + len(TRAPS)) for first in range(0, 13 * len(TRAPS), len(TRAPS))]
@@ -65,6 +65,19 @@ def test_a_mass_that_lags_is_not_kinematic(tmp_path, monkeypatch, mass, kinemati
     robot = vehicle()._replace(kv=1e6)
     task = task_of(robot._replace(xml=robot.xml | {"mass": mass}), tmp_path, monkeypatch)
     assert task.kinematic == task.chart_is_state == kinematic
+
+
+@pytest.mark.parametrize(("stiffness", "still"), [("1", True), ("1e7", False)])
+def test_what_a_spring_moves_is_not_run_backward(tmp_path, monkeypatch, stiffness, still):
+    robot = vehicle()._replace(kv=1e7, on_joint=f'stiffness="{stiffness}"')
+    task = task_of(robot, tmp_path, monkeypatch)
+    assert task.kinematic
+    assert stands_still(task) == still
+    z, u = np.array([[0.5, 1.0]]), np.array([[0.5]])
+    plant = task.placed(z)
+    plant.step(u)
+    plant.step_backward(u)
+    assert (np.abs(plant.qpos - z).max() < 1e-3) == still
 
 
 def test_a_saturated_servo_is_no_direct_one(tmp_path, monkeypatch):
@@ -193,6 +206,21 @@ def test_an_end_with_a_memory_is_refused(tmp_path, monkeypatch, code):
         BadInput, match=r"gives \d and then \d for the same row|change its attribute count"
     ):
         check_task(task)
+
+
+@pytest.mark.parametrize(
+    ("name", "code"),
+    [
+        ("danger", "(self, measured):\n        return measured[:, 1] - measured[:, 1].mean()"),
+        ("miss", "(self, z):\n        return 9 + z[:, 1] - z[:, 1].min()"),
+        ("state", "(self, z, rng=None):\n        return z, z - z.mean(axis=0)"),
+        ("direction", "(self, path):\n        return np.random.randint(0, 2, path.shape[1])"),
+    ],
+)
+def test_a_method_that_looks_at_other_rows_is_refused(tmp_path, monkeypatch, name, code):
+    task = task_of(methods(vehicle(), f"\n    def {name}{code}\n"), tmp_path, monkeypatch)
+    with pytest.raises(BadInput, match=rf"{name}\(\) gives .* for the same row"):
+        trial.try_methods(task)
 
 
 def test_a_callback_is_a_memory(vehicle):

@@ -221,8 +221,11 @@ WRONG = {
     "one place": (lambda: looking(lambda m: 0 * m + 1.5), r"where\(\) puts all .* at one place, as \[1.5, 1"),
     "one line": (lambda: looking(lambda m: m[:, [1, 1]]), r"where\(\) puts all .* on a line"),
     "one column": (lambda: looking(lambda m: m * [1, 0]), r"where\(\) puts all .* on a line"),
-    "three columns": (lambda: looking(lambda m: m[:, [0, 1, 1]]), r"where\(\) .*shape \(32, 3\)"),
+    "three columns": (lambda: looking(lambda m: m[:, [0, 1, 1]]), r"where\(\) .*shape \(64, 3\)"),
     "no places": (lambda: looking(lambda m: m / 0), r"where\(\) gives \[.*inf"),
+    "a name that is taken": (
+        lambda: Field({"_a": (1, 0, 0.1), "a": (2, 0, 0.1)}), "2 obstacles of field have the name 'a'"
+    ),
     "too many obstacles": (
         lambda: Field({f"_{k}": (k, 3, 0.1) for k in range(31)}), "31 obstacles, .* at most 30"
     ),

@@ -6,7 +6,7 @@ Behind it are the worst-case game (`game`), what is proved between its nodes (`p
 
 from hyrl_mj.judging.attacks import Attack, Budget, attack, attack_starts
 from hyrl_mj.judging.episodes import NoisyEpisodes, Regions, noisy_episodes
-from hyrl_mj.judging.evidence import VerdictSettings
+from hyrl_mj.judging.evidence import VerdictSettings, by_kind
 from hyrl_mj.judging.examination import USUAL, Examination, ExamineOptions, Subject, examine
 from hyrl_mj.judging.losses import Losses, sort_losses
 from hyrl_mj.judging.results import Arrivals, Kind, ModeResult, Retraining
@@ -33,6 +33,7 @@ __all__ = [
     "Word",
     "attack",
     "attack_starts",
+    "by_kind",
     "examine",
     "game",
     "listed",

@@ -1,6 +1,6 @@
 """The presets of a run's settings: fast, paper and smoke."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -225,7 +225,7 @@ def _stage1(task: Task, name: str, algorithm: str) -> Training:
         if known == "ppo" and task.mirror is None:
             training = replace(training, **_WITHOUT_MIRROR)
         if algorithm == task.learning.algorithm:
-            training = replace(training, **task.learning.training)
+            training = _with(training, task, "training")
     if name == "smoke":
         training = replace(training, samples=_SMOKE[known])
     if np.any(np.subtract(task.start_high, task.start_low) < task.chart.sides - 1e-9):
@@ -243,8 +243,25 @@ def _stage6(task: Task, name: str, algorithm: str) -> Training:
     if name == "paper":
         training = _MODES_PAPER_CONTINUOUS if continuous else _MODES_PAPER_DISCRETE
         return replace(training, warm_start=training.warm_start and training.algorithm == algorithm)
-    training = replace(_MODES_CONTINUOUS if continuous else _MODES_DISCRETE, **task.learning.modes)
+    usual = _MODES_CONTINUOUS if continuous else _MODES_DISCRETE
+    training = _with(usual, task, "modes")
     if name == "smoke":
         return replace(training, samples=_SMOKE_MODES, attempts=1)
     most = task.effort.trainings
     return training if most is None else replace(training, attempts=min(training.attempts, most))
+
+
+def _with(training: Training, task: Task, of: str) -> Training:
+    """Returns a training with the changes that `learning.training` or `learning.modes` of a task make.
+
+    Raises:
+        BadInput: there is no such field, or it cannot have the value.
+    """
+    changes, known = getattr(task.learning, of), [field.name for field in fields(training)]
+    for name in changes:
+        if name not in known:
+            raise unknown(f"field in learning.{of} of {task.name}", name, known)
+    try:
+        return replace(training, **changes)
+    except BadInput as error:
+        raise BadInput(f"learning.{of} of {task.name}: {error}") from error

@@ -249,6 +249,11 @@ class Plant:
             )
         self._sample(u, ids, sign=-1)
 
+    def coast(self) -> None:
+        """Advances all copies by one sample with controls of zero, as an inner loop could give them."""
+        self._wake()
+        self._advance(np.zeros((self.n, self.model.nu)), None, self.substeps)
+
     @property
     def invertible(self) -> bool:
         """Whether each degree of freedom has its own velocity actuator, strong and without a memory.

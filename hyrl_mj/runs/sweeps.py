@@ -16,6 +16,7 @@ import numpy as np
 from hyrl_mj.errors import BadArtifact, BadInput
 from hyrl_mj.files import artifacts
 from hyrl_mj.files.manifest import check_contents, may_hold
+from hyrl_mj.judging import by_kind
 from hyrl_mj.judging.game import LIMIT, Robustness
 from hyrl_mj.runs.directory import Run, load_run
 
@@ -273,12 +274,11 @@ def finished_run(path: Path) -> Run | None:
 def _figures(robustness: Robustness) -> dict[str, float | None]:
     """Returns the results of a run by name."""
     if (game := robustness.deciding) is None:
-        least: dict[str, float] = {}
-        for count in robustness.episodes:
-            name, episodes = f"{count.controller}_reached_{count.noise}", f"episodes_{count.noise}"
-            least[name] = min(count.reached, least.get(name, 1.0))
-            least[episodes] = min(count.episodes, least.get(episodes, count.episodes))
-        return {**least, **_compared(robustness)}
+        found: dict[str, float] = {}
+        for who in ("policy", "hyrl"):
+            for kind, (arrived, episodes) in by_kind(robustness, who).items():
+                found |= {f"{who}_reached_{kind}": arrived / episodes, f"episodes_{kind}": episodes}
+        return {**found, **_compared(robustness)}
     last = game.scores["hyrl"][-1]
     figures: dict[str, float | None] = {"open": last.open, "winnable": last.winnable}
     for i, when in ((0, "_without_noise"), (-1, "")):
@@ -303,13 +303,19 @@ def _compared(robustness: Robustness) -> dict[str, float]:
     """Returns what comparisons from the same starts tell of both controllers, of the worst kind of noise."""
     figures: dict[str, float] = {}
     for compared in robustness.comparisons:
-        n = max(compared.compared, 1)
-        if compared.noise == "attack":
-            figures["attacked"] = compared.compared
+        n, attack = compared.compared, compared.noise == "attack"
+        if attack:
+            for who, lost in compared.unaided.items():
+                figures[f"{who}_lost_without_noise"] = lost / compared.starts
+        if not n:  # no start that both win without noise
+            continue
+        if attack:
+            figures["attacked"] = n
         for who in compared.lost:
-            if compared.noise == "attack":
+            if attack:
                 figures[f"{who}_withstood_attack"] = 1 - compared.lost[who] / n
-                figures[f"{who}_lost_without_noise"] = compared.unaided[who] / compared.starts
+            if n == compared.lost[who]:  # none arrives, late or not
+                continue
             for name, value in (
                 ("late", compared.late[who] / n),
                 ("longest", compared.time[who][1]),

@@ -8,7 +8,6 @@ from math import nan
 import numpy as np
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.tasks import wrapped
 
 LONGEST_DELAY = 100  # [samples]: later than that no controller can act upon
 LEAST = 50  # samples: fewer do not tell noise from motion
@@ -23,7 +22,7 @@ UNITS = {
     for a, b, factor in ((a, b, x), (b, a, 1 / x))
 }
 
-ANYWHERE = np.pi / np.sqrt(3)  # the standard deviation of an angle that may be any [rad]
+ANYWHERE = 1 / np.sqrt(12)  # the standard deviation of an angle that may be any [turns]
 
 
 @dataclass(frozen=True)
@@ -99,7 +98,7 @@ def column_noise(
     r: np.ndarray | None,
     t: np.ndarray,
     dt: float,
-    turn: bool,
+    turn: float,
     share: float,
 ) -> ColumnNoise:
     """Returns the noise of one column.
@@ -110,7 +109,7 @@ def column_noise(
         r: (n,) references; None of a robot at rest.
         t: (n,) times [s], NaN in gaps.
         dt: the time of a sample [s].
-        turn: whether it is an angle [rad], whose difference by a whole turn is none.
+        turn: a whole turn of an angle, in its unit, which is no difference; 0 of what is no angle.
         share: the share of the samples that keeps the bound.
 
     Raises:
@@ -136,15 +135,16 @@ def column_noise(
         if r is not None:
             delay, remarks = _delay(name, y, r, fresh, turn)
         late = _shifted(reference, 0 if np.isnan(delay) else int(delay))
-        raw = wrapped(y - late) if turn else y - late
+        raw = _short(y - late, turn)
         used = fresh & np.isfinite(raw)
         if used.sum() < LEAST:
             why = f"{name} has fewer than {LEAST} samples with a reference that are not held"
             return ColumnNoise(name, remarks=(why,))
-        if turn and np.std(raw[used]) > ANYWHERE / 2:
+        if turn and np.std(raw[used]) > ANYWHERE * turn / 2:
             raise BadInput(
-                f"{name} errs by up to {np.abs(raw[used]).max():.3g} rad, all around the circle: if it is in "
-                f"degrees, give --scale {name}=0.0174533 {name}_ref=0.0174533"
+                f"{name} errs by up to {np.abs(raw[used]).max():.3g}, all around a turn of {turn:.6g}: give "
+                f"it in that unit; if it is in degrees and a turn is 2 pi, give --scale {name}=0.0174533 "
+                f"{name}_ref=0.0174533"
             )
         kept = np.clip(raw, *np.quantile(raw[used], [(1 - share) / 2, (1 + share) / 2]))
         slow, drift, rate, unsure = _drift(np.where(used, kept, nan), dt, tiny)
@@ -173,7 +173,7 @@ def column_noise(
         held_rate=held_rate,
         quantum=quantum if quantum > sigma / 100 else 0.0,  # a smaller one changes nothing
         bias=bias,
-        told_bias=abs(bias) if abs(bias) > unsure_bias else 0.0,
+        told_bias=abs(bias) if abs(bias) > max(unsure_bias, tiny) else 0.0,
         drift=drift,
         drift_rate=rate,
         bound=bound,
@@ -186,6 +186,11 @@ def column_noise(
         slow=slow[used],
         correlations=correlations,
     )
+
+
+def _short(difference: np.ndarray, turn: float) -> np.ndarray:
+    """Returns differences (n,), of angles the short way round; `turn` as in `column_noise`."""
+    return difference - turn * np.rint(difference / turn) if turn else difference
 
 
 def _again(y: np.ndarray, known: np.ndarray, reference: np.ndarray, tiny: float) -> np.ndarray:
@@ -247,8 +252,10 @@ def _check_units(name: str, y: np.ndarray, r: np.ndarray) -> None:
 
 def _check_turns(name: str, error: np.ndarray) -> None:
     """Raises `BadInput` if errors (n,) jump by whole turns, as those of an angle do."""
-    error = error[np.isfinite(error)]
-    if len(error) and np.std(wrapped(error)) < min(np.std(error), ANYWHERE) / 2:
+    error, turn = error[np.isfinite(error)], 2 * np.pi
+    # What differs by less than half a turn does not jump.
+    least = min(np.std(error), ANYWHERE * turn) / 2 if len(error) and np.ptp(error) > np.pi else 0.0
+    if least and np.std(_short(error, turn)) < least:
         raise BadInput(
             f"{name} differs from {name}_ref by up to {np.abs(error).max():.3g}, and by far less up to whole "
             f"turns: if it is an angle in rad, give --turn {name}"
@@ -281,7 +288,7 @@ def _shifted(values: np.ndarray, lag: int) -> np.ndarray:
 
 
 def _delay(
-    name: str, y: np.ndarray, r: np.ndarray, fresh: np.ndarray, turn: bool
+    name: str, y: np.ndarray, r: np.ndarray, fresh: np.ndarray, turn: float
 ) -> tuple[float, list[str]]:
     """Returns by how many samples y is later than r, by least squares; NaN and why if it cannot be told.
 
@@ -296,7 +303,7 @@ def _delay(
         error = y - _shifted(r, lag)
         error = error[fresh & np.isfinite(error)]
         if len(error) >= LEAST:
-            error = wrapped(error) if turn else error
+            error = _short(error, turn)
             parts = np.linspace(0, len(error), 11).astype(int)[1:-1]
             squares[i] = np.mean(signal.detrend(error, bp=parts) ** 2)
     i = int(np.clip(np.argmin(squares), 1, len(lags) - 2))
@@ -306,7 +313,7 @@ def _delay(
     # Twice the logarithm of the likelihood ratio of the next best delay.
     sure = fresh.sum() * np.log(max(beside.min(), best) / best)
     if sure < stats.chi2.isf(CHANCE, 1):
-        return nan, [f"{name}_ref moves too little for a delay to be told"]
+        return nan, [f"{name}_ref moves too little or too evenly for a delay to be told"]
     if squares[i] > squares.min():
         return nan, [f"{name} may be more than {most} samples late: give a longer log"]
     middle = lags[i] + 0.5 * (beside[0] - beside[1]) / (beside.sum() - 2 * best)

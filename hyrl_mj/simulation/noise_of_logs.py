@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from math import nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -14,7 +15,7 @@ from hyrl_mj.errors import BadInput, counted, unknown
 from hyrl_mj.files.logs import Log
 from hyrl_mj.simulation.column_noise import LEAST, LONGEST_DELAY, ColumnNoise, column_noise
 from hyrl_mj.simulation.noise import LOG, Noise, Sample, Signal
-from hyrl_mj.simulation.sensors import Sensor
+from hyrl_mj.simulation.sensors import Sensor, begins_with_chart
 
 if TYPE_CHECKING:
     from hyrl_mj.policies import Controller
@@ -28,8 +29,9 @@ MOST = 20_000_000  # samples with gaps between them, which take 160 MB a column 
 class LogNoise:
     """The noise of a log; as noise its errors, measurement minus reference, without delays and held samples.
 
-    Each run begins at a time of the log that is drawn for it, and goes on at its beginning where it ends. The
-    columns of the log are those of the chart with the same names; the others have no noise.
+    Each run begins at a time of the log that is drawn for it, and goes on at its beginning where it ends.
+    What a log does not tell, because of gaps in time or lost samples, is left out. The columns of the log are
+    those of the chart with the same names; the others have no noise.
 
     Attributes:
         columns: the noise of each column.
@@ -73,7 +75,7 @@ class LogNoise:
         """Returns the signal for one closed loop.
 
         Raises:
-            BadInput: the log has no column of the chart.
+            BadInput: the log has no column of the chart, or the measurement does not begin with the chart.
         """
         columns = {c.name: c for c in self.columns if len(c.errors) > 1}
         found = [(i, columns[name]) for i, name in enumerate(task.chart.names) if name in columns]
@@ -81,6 +83,11 @@ class LogNoise:
             raise BadInput(
                 f"the log has errors of {', '.join(columns)}, and the chart of {task.name} is "
                 f"({', '.join(task.chart.names)}): rename the columns of the log"
+            )
+        if not begins_with_chart(task):
+            raise BadInput(
+                f"the errors of a log are those of chart coordinates, and the measurement of {task.name} "
+                f"does not begin with its chart ({', '.join(task.chart.names)}): give another noise"
             )
         signal = _Windows(task, found, self.bound)
         task.with_noise(tuple(signal.shares.tolist())).check_noise(signal.bound)
@@ -98,26 +105,29 @@ class _Windows(Signal):
         for i, column in columns:
             shares[i] = np.abs(column.errors).max() / (bound or 1.0)
         super().__init__(bound, shares)
-        self._columns, self._dt = columns, task.dt
-        self._first = max(column.times[0] for _, column in columns)
-        self._time = min(column.times[-1] for _, column in columns) - self._first
-        if self._time <= 0:
+        self._dt = task.dt
+        every = [column for _, column in columns]
+        times = reduce(np.intersect1d, [column.times for column in every])
+        if len(times) < 2:
             raise BadInput("the columns of the log have no time in common: give them the same rows")
+        self._errors = np.zeros((len(times), len(shares)))
+        for i, column in columns:
+            self._errors[:, i] = column.errors[np.searchsorted(column.times, times)]
+        # What lasts longer than the rows are apart is a gap.
+        steps = np.diff(times)
+        steps = np.minimum(steps, 2 * np.quantile(steps, 0.95))
+        self._times = np.concatenate([[0.0], np.cumsum(steps)])
 
     def reset(self, n: int, rng: np.random.Generator) -> None:
         super().reset(n, rng)
         self._window = np.zeros(n)
 
     def sample(self, now: Sample) -> np.ndarray:
-        fresh = now.rows[now.k == 0]
+        fresh, whole = now.rows[now.k == 0], self._times[-1]
         if len(fresh):
-            self._window[fresh] = self.rng.uniform(0.0, self._time, len(fresh))
-        t = self._first + (self._window[now.rows] + now.k * self._dt) % self._time
-        noise = np.zeros_like(now.measurement)
-        for i, column in self._columns:
-            latest = np.searchsorted(column.times, t, side="right") - 1
-            noise[:, i] = column.errors[latest]
-        return noise
+            self._window[fresh] = self.rng.uniform(0.0, whole, len(fresh))
+        t = (self._window[now.rows] + now.k * self._dt) % whole
+        return self._errors[np.searchsorted(self._times, t, side="right") - 1]
 
 
 def noise_from_log(
@@ -127,7 +137,7 @@ def noise_from_log(
     dt: float | None = None,
     at_rest: bool = False,
     scale: Mapping[str, float] | None = None,
-    turn: Sequence[str] = (),
+    turn: Sequence[str] | Mapping[str, float] = (),
     share: float = 0.999,
 ) -> LogNoise:
     """Returns the noise that the measurements of a log have.
@@ -139,7 +149,8 @@ def noise_from_log(
         dt: the time between two rows [s], of a log without times.
         at_rest: whether the robot stood still, so that no reference is needed.
         scale: factors by which columns are multiplied.
-        turn: columns of angles [rad], whose difference by a whole turn is none.
+        turn: columns of angles [rad], whose difference by a whole turn is none; or, by their names, what a
+            whole turn is in their units.
         share: the share of the samples that keeps the bound.
 
     Raises:
@@ -159,7 +170,8 @@ def noise_from_log(
     chosen = _chosen(path, log.names, columns, at_rest)
     clock = [name for name in log.names if name in TIMES][:1]
     looked_at = [*chosen, *([] if at_rest else [f"{name}_ref" for name in chosen])]
-    for name in (*turn, *factors):
+    turns = turn if isinstance(turn, Mapping) else dict.fromkeys(turn, 2 * np.pi)
+    for name in (*turns, *factors):
         if name not in looked_at:
             raise unknown(f"column of {path}", name, looked_at)
     data = log.read([*clock, *looked_at])
@@ -189,7 +201,9 @@ def noise_from_log(
     t, found = placed(times), []
     for name in chosen:
         r = None if at_rest else placed(data[f"{name}_ref"])
-        found.append(column_noise(name, placed(data[name]), r, t, step, name in turn, share))
+        found.append(
+            column_noise(name, placed(data[name]), r, t, step, turns.get(name, 0.0), share)
+        )
     if any(column.held or column.delay >= 1 for column in found):
         remarks.append(
             f"delay and held samples are counted in samples of this log, of {step:.3g} s: for a robot with "
@@ -261,7 +275,7 @@ def noise_of(task: Task, text: str, bound: float, everywhere: bool = False) -> N
     """Returns the noise that a text names: a kind, a sum of parts, or "log FILE" with the errors of a log.
 
     Args:
-        task: whose periodic coordinates are angles in a log.
+        task: whose periodic coordinates turn in a log as they do in its chart.
         text: the text.
         bound, everywhere: of a kind of noise; the others tell their own bounds.
 
@@ -272,9 +286,9 @@ def noise_of(task: Task, text: str, bound: float, everywhere: bool = False) -> N
     noise: NamedNoise
     if word == LOG and rest:
         log, chart = Log(path := Path(rest.strip())), task.chart
-        turn = [n for n, turns in zip(chart.names, chart.periodic, strict=True) if turns]
-        turn = [name for name in turn if name in log.names]
-        noise = replace(noise_from_log(log, turn=turn), kind=f"{word} {path.name}")
+        sides = zip(chart.names, chart.sides.tolist(), chart.periodic, strict=True)
+        turns = {name: side for name, side, turns in sides if turns and name in log.names}
+        noise = replace(noise_from_log(log, turn=turns), kind=f"{word} {path.name}")
     else:
         noise = Sensor.parse(text) if rest else Noise(text, bound, everywhere)
     if rest and everywhere:

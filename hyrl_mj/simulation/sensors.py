@@ -200,6 +200,13 @@ class Part:
         return Part(word, value, options)
 
 
+def begins_with_chart(task: Task) -> bool:
+    """Returns whether the measurement begins with the coordinates of the chart."""
+    measured = task.placed(task.starts(16, np.random.default_rng(0))).measurement
+    apart = task.chart.difference(task.z(measured), measured[:, : task.chart.dimension])
+    return bool(np.abs(apart).max() <= 1e-6)
+
+
 # A part that does nothing.
 NOTHING = Part("uniform", 0.0)
 
@@ -280,15 +287,12 @@ class Sensor:
         reach, d = self.reach(task), task.chart.dimension
         if bound := float(reach[:d].max()):
             task.with_noise(tuple((reach / bound).tolist())).check_noise(bound)
-        if self.late:
-            measured = task.placed(task.starts(16, np.random.default_rng(0))).measurement
-            apart = task.chart.difference(task.z(measured), measured[:, :d])
-            if np.abs(apart).max() > 1e-6:
-                raise BadInput(
-                    f"what a robot moves while a sensor is late is known of each column, and those of "
-                    f"{task.name} do not begin with its chart ({', '.join(task.chart.names)}): let the "
-                    "measurement begin with them, or leave delay and hold out"
-                )
+        if self.late and not begins_with_chart(task):
+            raise BadInput(
+                f"what a robot moves while a sensor is late is known of each column, and those of "
+                f"{task.name} do not begin with its chart ({', '.join(task.chart.names)}): let the "
+                "measurement begin with them, or leave delay and hold out"
+            )
 
     def on(self, task: Task) -> tuple[float, tuple[float, ...]]:
         """Returns the noise bound, and its shares (p,), that cover all that it can do to a chart point.

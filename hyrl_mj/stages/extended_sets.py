@@ -26,7 +26,7 @@ from hyrl_mj.stages.partition import (
 )
 from hyrl_mj.stages.reach import backward_reach, forward_reach, runs_from_outside, shortest
 from hyrl_mj.stages.refinement import refined
-from hyrl_mj.tasks import Task
+from hyrl_mj.tasks import Task, stands_still
 
 
 @dataclass(frozen=True)
@@ -164,7 +164,7 @@ def extend(
     off = distance_to(task.chart, points, grid.nodes)
     rims = [part.mask & (off <= near) for part in parts]
     # The cells that backward runs visit are those of a grid.
-    backward = task.kinematic and isinstance(grid, Grid)
+    backward = task.kinematic and isinstance(grid, Grid) and stands_still(task)
     longest = round(settings.longest / task.dt)
 
     @cache

@@ -140,6 +140,11 @@ def _check_scene(task: Task) -> None:
 
 
 def _check_training(task: Task) -> None:
+    if task.input_units and len(task.input_units) != len(task.inputs):
+        raise BadInput(
+            f"input_units has {len(task.input_units)} value(s), and there are {len(task.inputs)} input(s): "
+            "give one each, or none"
+        )
     levels, most = task.learning.levels, 1_000
     if levels is not None and not 2 <= levels ** len(task.inputs) <= most:
         raise BadInput(

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 # sample, of which this is a tenth; and it does not add up, because what lags behind once has caught up later.
 # A proof takes the lag that it measures into account.
 ALIKE = 1e-3
+ROUNDING = 1e-12  # of positions
 # Runs side by side, and the samples after which those that do not hold their input draw a new one.
 RUNS, HELD = 512, 8
 # Moves come close to the largest one, and do not reach it: where it depends smoothly on the state, those of
@@ -59,8 +60,24 @@ def begins_anew(task: Task, of_chart: bool = False) -> bool:
             off.append(np.abs(hop - (anew.qpos - copied))[goes_on])
             hops.append(np.abs(hop)[goes_on])
     longest = np.concatenate(hops).max(axis=0)
-    rounding = 1e-12  # of positions
-    return bool((np.concatenate(off) <= ALIKE * longest + rounding).all())
+    return bool((np.concatenate(off) <= ALIKE * longest + ROUNDING).all())
+
+
+def stands_still(task: Task) -> bool:
+    """Returns whether nothing but its controls moves a kinematic robot.
+
+    What a spring or a bias of an actuator adds to its speeds does not change its sign with the controls, so
+    that a step backward would not lead back.
+    """
+    rng = np.random.default_rng(0)
+    plant = task.placed(task.chart.draw(500, rng), rng)
+    start = plant.qpos
+    plant.coast()
+    still = plant.qpos
+    with mujoco_log.kept():
+        plant.step(task.draw_inputs(len(start), rng))
+    longest = np.abs(plant.qpos - still).max(axis=0)
+    return bool((np.abs(still - start) <= ALIKE * longest + ROUNDING).all())
 
 
 def _inputs(task: Task, n: int, rng: np.random.Generator) -> np.ndarray:

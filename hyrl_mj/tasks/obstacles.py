@@ -1,5 +1,6 @@
 """What a task's runs pass: the obstacles of its MJCF, and the numbers and names of the ways past them."""
 
+from collections import Counter
 from collections.abc import Sequence
 from itertools import combinations
 
@@ -23,7 +24,7 @@ def islands(model: mujoco.MjModel) -> dict[str, int]:
     follows "obstacle".
 
     Raises:
-        BadInput: there are more than `MOST_OBSTACLES`.
+        BadInput: there are more than `MOST_OBSTACLES`, or two have one name.
     """
     geoms = mjcf.obstacles(model)
     ids = [mjcf.object_id(model, mujoco.mjtObj.mjOBJ_GEOM, name) for name in geoms]
@@ -36,7 +37,14 @@ def islands(model: mujoco.MjModel) -> dict[str, int]:
             f"{mjcf.model_name(model)} has {len(kept)} obstacles, and ways are told apart past at most "
             f"{MOST_OBSTACLES}: give the task a direction() of its own"
         )
-    return {model.geom(i).name.removeprefix("obstacle").lstrip("_ "): i for i in kept}
+    found = {i: model.geom(i).name.removeprefix("obstacle").lstrip("_ ") for i in kept}
+    for name, count in Counter(found.values()).items():
+        if count > 1:
+            raise BadInput(
+                f"{count} obstacles of {mjcf.model_name(model)} have the name {name!r}, what follows "
+                '"obstacle" and "_" in the names of their geoms: give each another one'
+            )
+    return {name: i for i, name in found.items()}
 
 
 def touching(model: mujoco.MjModel, data: mujoco.MjData, ids: Sequence[int]) -> list[list[int]]:

@@ -26,6 +26,8 @@ STARTS = 32  # as training draws them
 EFFECT = 10
 # Number of the sample -> inputs (n, m).
 Inputs = Callable[[int], np.ndarray]
+# Indices (k,) of rows -> what a method gives for them (k, ...).
+OfRows = Callable[[np.ndarray], np.ndarray]
 
 
 def try_random(task: Task) -> np.ndarray:
@@ -71,16 +73,15 @@ def try_methods(task: Task) -> None:
     rng, before = np.random.default_rng(0), _attributes(task)
     z = np.vstack([task.starts(STARTS, rng), task.chart.draw(STARTS, rng)])
     measured, order = task.placed(z).measurement, rng.permutation(len(z))
-    for name in ("z", "observation", "ending", "verdict"):
-        method = getattr(task, name)
-        first = method(measured)
+    for name, asked in _methods(task, z, measured).items():
+        first = asked(every := np.arange(len(z)))
         shuffled = np.empty_like(first)
-        shuffled[order] = method(measured[order])
+        shuffled[order] = asked(order)
         alone = first.copy()
         for row in order[:STARTS]:
-            alone[row] = method(measured[[row]])[0]
-        for again in (shuffled, method(measured), alone):
-            same = np.isclose(again, first, rtol=0, atol=1e-9, equal_nan=True)
+            alone[row] = asked(np.array([row]))[0]
+        for again in (shuffled, asked(every), alone):
+            same = np.isclose(again, first, rtol=1e-9, atol=1e-9, equal_nan=True)
             if not same.all():
                 row = int(np.argwhere(~same)[0][0])
                 raise BadInput(
@@ -95,6 +96,27 @@ def try_methods(task: Task) -> None:
                 f"its methods change its attribute {name} when they are asked: a task remembers nothing, so "
                 "compute it from the measurement"
             )
+
+
+def _methods(task: Task, z: np.ndarray, measured: np.ndarray) -> dict[str, OfRows]:
+    """Returns the methods of a task by name, each of rows of chart points (n, d) or measurements (n, p)."""
+
+    def of_measured(name: str) -> OfRows:
+        return lambda rows: getattr(task, name)(measured[rows])
+
+    def state(rows: np.ndarray) -> np.ndarray:
+        return np.hstack([part for part in task.state(z[rows]) if part is not None])
+
+    names = ["z", "observation", "ending", "verdict"]
+    if type(task).plant is not Task.plant:  # an environment answers the rest by itself
+        return {name: of_measured(name) for name in names}
+    path = np.linspace(z, np.random.default_rng(0).permutation(z), 5)
+    names += ["danger"] if task.gives_direction else ["danger", "where"]
+    found = {name: of_measured(name) for name in names}
+    found |= {"state": state, "miss": lambda rows: task.miss(z[rows])}
+    if task.gives_direction:
+        found["direction"] = lambda rows: task.direction(path[:, rows])
+    return found
 
 
 def _attributes(task: Task) -> dict[str, Any]:
@@ -163,30 +185,40 @@ def try_where(task: Task) -> None:
 
 
 def try_place(task: Task) -> None:
-    """Raises `BadInput` if the chart does not begin with the place of the tracked point, as where() takes it.
+    """Raises `BadInput` if where() does not give the place of the tracked point, or by default of the chart.
 
     Obstacles are at places of the world: in other units, or in another order, runs pass them on no side.
     """
     model, tracked = task.model, task.scene.tracked
     kinds = mujoco.mjtObj.mjOBJ_SITE, mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_GEOM
     named = any(mujoco.mj_name2id(model, kind, tracked) >= 0 for kind in kinds)
-    if type(task).where is not Task.where or type(task).plant is not Task.plant or not named:
+    if type(task).plant is not Task.plant or not named:
         return
     rng = np.random.default_rng(0)
-    z = task.chart.draw(STARTS, rng)
+    plant = task.placed(z := task.chart.draw(STARTS, rng), rng)
     where, number = mjcf.point_of(model, tracked)
     moves = np.flatnonzero(model.body_weldid[model.geom_bodyid] != 0)
     data, places, reach = mujoco.MjData(model), [], 0.0
-    for qpos in task.state(z, rng)[0]:
+    for qpos in plant.qpos:
         mjcf.place(model, data, qpos, task.mocap)
         place = getattr(data, where)[number]
         places.append(place[list(task.plane)].copy())
         far = np.linalg.norm(data.geom_xpos[moves] - place, axis=1) + model.geom_rbound[moves]
         reach = max(reach, float(far.max(initial=0.0)))
-    moved = np.ptp(places, axis=0)
-    off = task.where(task.placed(z).measurement) - places
+    moved, given = np.ptp(places, axis=0), task.where(plant.measurement)
+    off = np.abs(given - places).max(axis=1)
+    away = off.max() > (reach or np.inf)
+    if type(task).where is not Task.where:  # it may be another point of the robot
+        if away:
+            row = int(off.argmax())
+            raise BadInput(
+                f"where() gives {given[row].tolist()} at {task.chart.format(z[row])}, and {tracked} is at "
+                f"{places[row].tolist()} in the plane {task.plane} of the world, in metres: let it give the "
+                "place of the robot there, or name another point in scene.tracked"
+            )
+        return
     # A point may be off the middle of a robot that turns, but not off the robot.
-    if (np.ptp(off, axis=0) > moved / 2).any() or np.abs(off).max() > (reach or np.inf):
+    if away or (np.ptp(given - places, axis=0) > moved / 2).any():
         names = " and ".join(task.chart.names[:2])
         raise BadInput(
             f"its chart begins with {names}, and these are not the place of {tracked} in the plane "

@@ -6,10 +6,11 @@ Only `summary` would be pandas' work: the rest is the text of each figure, and c
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
+from hyrl_mj.errors import counted
 from hyrl_mj.judging.game import percent
 from hyrl_mj.runs.improvement import Mean, improvements
 from hyrl_mj.runs.sweeps import Row, Sweep, summary
@@ -98,9 +99,8 @@ def summary_table(sweep: Sweep) -> Table:
         ["verdicts", *(_verdicts(group) for group in done.values())],
     ]
     for name in shown(sweep.rows):
-        found = [summary(row.figures.get(name) for row in group) for group in done.values()]
-        cells = ["-" if three is None else _range(COLUMNS[name], *three) for three in found]
-        rows.append([COLUMNS[name].heading, *cells])
+        values = [[row.figures.get(name) for row in group] for group in done.values()]
+        rows.append([COLUMNS[name].heading, *(_cell(COLUMNS[name], own) for own in values)])
     title = "median over the seeds (least to greatest)"
     return Table(title, ["figure", *(setting.title for setting in groups)], rows)
 
@@ -187,6 +187,11 @@ def print_sweep(sweep: Sweep) -> None:
             print(f"{row.name}: {row.state}{f': {row.sentence}' if row.sentence else ''}")
 
 
-def _range(column: Column, median: float, least: float, greatest: float) -> str:
-    texts = [column.show(value) for value in (median, least, greatest)]
-    return texts[0] if texts[1] == texts[2] else f"{texts[0]} ({texts[1]} to {texts[2]})"
+def _cell(column: Column, values: Sequence[float | None]) -> str:
+    """Returns median, least and greatest of some figures, and of how many runs there is none."""
+    if (three := summary(values)) is None:
+        return "-"
+    median, *ends = map(column.show, three)
+    text = median if ends[0] == ends[1] else f"{median} ({' to '.join(ends)})"
+    missing = sum(value is None for value in values)
+    return f"{text}, none in {missing} of {counted(len(values), 'run')}" if missing else text
