@@ -141,6 +141,19 @@ class Tied(At):
         self.data.qpos[2:4] = place
 
 
+class Towing(Tied):
+    """The load hangs on a rope."""
+
+    xml = Tied.xml.replace('<geom size="0.05"', '<site name="hook"/><geom size="0.05"')
+    xml = xml.replace('<geom type="sphere"', '<site name="tail"/><geom type="sphere"')
+    xml = xml[: xml.index("<equality>")] + xml[xml.index("</equality>") + 11 :]
+    xml = xml.replace(
+        "<actuator>",
+        '<tendon><spatial limited="true" range="0 0.5"><site site="hook"/><site site="tail"/></spatial>'
+        "</tendon><actuator>",
+    )
+
+
 @pytest.mark.parametrize(
     ("make", "given", "message"),
     [
@@ -153,7 +166,12 @@ class Tied(At):
         (FenceByDistance, {"seed": 0}, r"notes where it leads to \(most\)"),
         (FenceByRegion, {}, "draws region|goes otherwise after"),
         (FenceByMarker, {"seed": 0}, r"notes where it leads to \(site_pos of its model\)"),
-        (Tied, {"chart": {"x": "x", "y": "y"}}, "equality constraints tie the robot of Tied"),
+        (Tied, {"chart": {"x": "x", "y": "y"}}, "or limits of tendons tie the robot of Tied"),
+        (
+            Towing,
+            {"chart": {"x": "x", "y": "y"}},
+            "tie the robot of Towing to something that stays",
+        ),
     ],
 )
 def test_what_stays_at_the_place_of_the_reset_is_refused(make, given, message):

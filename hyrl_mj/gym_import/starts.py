@@ -32,7 +32,7 @@ OF_MODEL = " of its model"
 # Samples of a run from the start of a reset, and by how much it may differ from a run that is put there, as a
 # share of its numbers: rounding.
 NATURAL, SAME = 100, 1e-6
-# By how much equality constraints may be violated more than after resets [m, rad].
+# By how much equality constraints and limits of tendons may be violated more than after resets [m, rad].
 VIOLATED = 1e-3
 
 
@@ -45,7 +45,7 @@ class Resets:
         differ: the names of what is remembered otherwise than after the first reset, each with the seeds that
             bring a value for the first time, `VALUES` at most.
         numbers: (64, k) of the attributes and parts of the model that differ and are numbers, by name.
-        violation: by how much they violate equality constraints at most [m, rad].
+        violation: by how much they violate equality constraints and limits of tendons at most [m, rad].
     """
 
     states: np.ndarray
@@ -104,10 +104,11 @@ def resets_of(instance: Instance) -> Resets:
 
 
 def _violation(instance: Instance) -> float:
-    """Returns by how much equality constraints are violated at most [m, rad]."""
-    data = instance.data
-    of_equality = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
-    return float(np.abs(data.efc_pos[of_equality]).max(initial=0.0))
+    """Returns by how much equality constraints and limits of tendons are violated at most [m, rad]."""
+    kinds, off = instance.data.efc_type, instance.data.efc_pos
+    equal = np.abs(off[kinds == mujoco.mjtConstraint.mjCNSTR_EQUALITY])
+    beyond = -off[kinds == mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON]
+    return float(np.append(equal, beyond).max(initial=0.0))
 
 
 def own_of(spec: EnvironmentSpec, model: mujoco.MjModel) -> np.ndarray:
@@ -210,7 +211,7 @@ def check_noted(spec: EnvironmentSpec, resets: Resets) -> None:
     Runs are played after the reset as it is, and where what follows the place has been moved along. Both have
     to go alike, to their ends and under inputs that do not change, which lead far away.
     """
-    _check_equalities(spec, resets)
+    _check_ties(spec, resets)
     _check_following(spec, resets)
     _check_led(spec)
     drawn = np.ptp(spec.z(resets.states), axis=0).any()
@@ -222,17 +223,17 @@ def _starts(spec: EnvironmentSpec, rng: np.random.Generator) -> np.ndarray:
     return spec.state_at(spec.anywhere(rng, EPISODES))
 
 
-def _check_equalities(spec: EnvironmentSpec, resets: Resets) -> None:
+def _check_ties(spec: EnvironmentSpec, resets: Resets) -> None:
     instance = Instance(spec)
-    if not instance.model.neq:
+    if not (instance.model.neq or instance.model.tendon_limited.any()):
         return
     for state in _starts(spec, np.random.default_rng(11)):
         instance.put(state)
         if (off := _violation(instance)) > VIOLATED + 2 * resets.violation:
             raise BadInput(
-                f"equality constraints tie the robot of {spec.name} to something that stays where its "
-                f"reset leads to: at another start on the chart they are off by {off:.3g} m or rad. Leave "
-                "them out, or name a chart of what they tie together"
+                f"equality constraints or limits of tendons tie the robot of {spec.name} to something that "
+                f"stays where its reset leads to: at another start on the chart they are off by {off:.3g} m "
+                "or rad. Leave them out, name a chart of what they tie together, or give its bounds"
             )
 
 
