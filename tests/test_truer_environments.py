@@ -663,6 +663,12 @@ class Levels(Puck):
         self.action_space = spaces.Box(-4, 4, (2,), dtype=np.int64)
 
 
+class Counted(Puck):
+    def __init__(self):
+        super().__init__()
+        self.action_space = spaces.Discrete(3, start=-1)
+
+
 class Beginning(Puck):
     """Observes how fast it has gone so far, which at the start is 0 / 0."""
 
@@ -675,6 +681,7 @@ class Beginning(Puck):
     ("make", "given", "message"),
     [
         (Levels, {}, "Levels takes a Box of int64 as its actions, .* would be rounded"),
+        (Counted, {}, r"counts its actions from -1, .*: let it take Discrete\(3\)"),
         (Beginning, {}, r"Beginning observes nan in observation\[\d\]"),
         (
             lambda: RecordEpisodeStatistics(Puck()),
