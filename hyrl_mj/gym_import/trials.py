@@ -284,14 +284,18 @@ def goes_on(pool: Pool, of_chart: bool = False) -> bool:
         of_chart: whether the states at rest at the chart points of the runs are written, so that the chart is
             all there is; by default MuJoCo's states of the runs.
     """
-    spec = pool.spec
+    spec, rng = pool.spec, np.random.default_rng(4)
     for plant, u in _runs(pool, 4, 48 if of_chart else EPISODES):
         going = np.flatnonzero(plant.measurement[:, -1] == 0)
         before = plant.state[going]
         plant.step(u[going], going)
         if not len(going):
             return True
-        written = spec.state_at(spec.z(before)) if of_chart else before
+        written = before
+        if of_chart:
+            written = spec.state_at(spec.z(before))
+            # The time, which comes first in a state, is no part of the chart, and may matter late.
+            written[:, 0] = rng.uniform(0, spec.max_steps * spec.dt, len(going))
         try:
             after, seen, report = pool.scatter("branch", written, u[going])
         except BadInput:
