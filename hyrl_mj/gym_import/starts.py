@@ -296,8 +296,10 @@ def _check_following(spec: EnvironmentSpec, resets: Resets) -> None:
 def _renewed(instance: Instance) -> Instance:
     """Returns what can play another run: an instance, or a new one if something outlasts its resets."""
     instance.noted = None
-    worn = instance.spec.anew or instance.renew()
-    return Instance(instance.spec) if worn else instance
+    if instance.spec.anew or instance.renew():
+        instance = Instance(instance.spec)
+        instance.renew()  # what it is like when it is new
+    return instance
 
 
 # What is seen, and the inputs (m,) that go on from there.
