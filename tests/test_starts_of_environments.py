@@ -179,6 +179,42 @@ def test_what_stays_at_the_place_of_the_reset_is_refused(make, given, message):
         from_gymnasium(make, steps=60, **given)
 
 
+class Moving(gym.Wrapper):
+    """Its resets put the robot to a place of their own."""
+
+    def reset(self, **options):
+        self.env.reset(**options)
+        self.unwrapped.data.qpos[:2] = [-1.5, 0.4]
+        return self.unwrapped._get_obs(), {}
+
+
+class Later(At):
+    """A gate that closes late holds it; it moves without inertia."""
+
+    gate = 4.5
+
+    def step(self, action):
+        before = self.data.qpos.copy()
+        self.data.qpos[:2] += 0.02 * action
+        held = self.data.time > self.gate and (before[0] - 0.9) * (self.data.qpos[0] - 0.9) < 0
+        self.data.time += 0.1
+        mujoco.mj_forward(self.model, self.data)
+        if held or self.data.ncon:
+            self.data.qpos[:] = before
+        off = float(np.linalg.norm(self.data.qpos[:2] - GOAL))
+        return self._get_obs(), -off, False, False, {"success": off < 0.25}
+
+
+def test_a_wrapper_that_moves_the_robot_to_its_own_start_is_refused():
+    with pytest.raises(BadInput, match=r"wrapper of lambda moves the robot in its reset\(\)"):
+        from_gymnasium(lambda: Moving(At()), steps=20, pinned={"qvel[0]": 0.0})
+
+
+def test_a_chart_is_no_state_where_the_time_matters_late():
+    kinds = Later, type("Open", (Later,), {"gate": np.inf})
+    assert [from_gymnasium(kind, steps=100).chart_is_state for kind in kinds] == [False, True]
+
+
 def test_one_place_may_be_noted_where_runs_begin_there_alone():
     assert from_gymnasium(FenceAtOnePlace, starts="reset", steps=5).max_steps == 5
     found = from_gymnasium(type("OnePlace", (At,), {"draws": False}), steps=5).found
@@ -290,6 +326,12 @@ class Servo(At):
         self.data.ctrl[:] = place
 
 
-@pytest.mark.parametrize(("make", "given"), [(Shaped, {"seed": 0}), (Servo, {})])
+def shared_rewards():
+    return gym.wrappers.NormalizeReward(At())
+
+
+@pytest.mark.parametrize(
+    ("make", "given"), [(Shaped, {"seed": 0}), (Servo, {}), (shared_rewards, {})]
+)
 def test_what_matters_to_no_run_is_accepted(make, given):
     assert from_gymnasium(make, steps=20, **given).max_steps == 20

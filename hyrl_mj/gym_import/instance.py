@@ -261,7 +261,12 @@ class Instance:
         if self.start is None:
             self.take(result)
         else:
-            self.start, self.observation = None, self._flat(result)
+            start, self.start, self.observation = self.start, None, self._flat(result)
+            if (self.physics.read() != start)[self.spec.places].any():
+                raise BadInput(
+                    f"a wrapper of {self.name} moves the robot in its reset(), so no run begins where it "
+                    "is put: let the reset of the environment itself do so"
+                )
 
     def finish(self) -> None:
         """Refuses an episode in which random numbers were drawn, or what is shared or looked at changed."""
@@ -479,7 +484,7 @@ class Instance:
         """Returns the environment's action for inputs u (m,)."""
         space: Any = self._actions
         if isinstance(space, spaces.Discrete):
-            return int(space.start + round(float(u[0])))
+            return round(float(u[0]))
         return u.astype(space.dtype).reshape(space.shape)
 
     def stepped(self, u: np.ndarray) -> Any:
