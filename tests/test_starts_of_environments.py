@@ -160,6 +160,7 @@ class Towing(Tied):
         (Setpoint, {"seed": 0}, r"notes where it leads to \(ctrl\[0\], ctrl\[1\]\)"),
         (Centred, {}, r"notes where it leads to \(ctrl\[0\], ctrl\[1\]\)"),
         (Integrated, {}, r"notes where it leads to \(act\[0\], act\[1\]\)"),
+        (Fence, {}, "draws home, or sets it to the place that it leads to, .* first step"),
         (Fence, {"seed": 0}, r"notes where it leads to \(home\)"),
         (Fence, {"seed": 0, "starts": "reset"}, r"notes where it leads to \(home\)"),
         (FenceAtOnePlace, {}, r"notes where it leads to \(home\)"),
@@ -331,7 +332,7 @@ def shared_rewards():
 
 
 @pytest.mark.parametrize(
-    ("make", "given"), [(Shaped, {"seed": 0}), (Servo, {}), (shared_rewards, {})]
+    ("make", "given"), [(Shaped, {}), (Shaped, {"seed": 0}), (Servo, {}), (shared_rewards, {})]
 )
 def test_what_matters_to_no_run_is_accepted(make, given):
     assert from_gymnasium(make, steps=20, **given).max_steps == 20

@@ -159,6 +159,15 @@ def _predicted(terms: np.ndarray, table: np.ndarray) -> Predict | None:
     return predict
 
 
+def follows(spec: EnvironmentSpec, model: mujoco.MjModel, resets: Resets, name: str) -> bool:
+    """Returns whether an attribute or a part of the model follows the place that resets lead to."""
+    if (table := resets.numbers.get(name)) is None:
+        return False
+    terms = _terms(spec, model, resets.states)
+    predict = _predicted(terms, table)
+    return predict is not None and np.allclose([predict(of) for of in terms], table, SAME, SAME)
+
+
 def _setpoints(instance: Instance, state: np.ndarray, now: np.ndarray) -> np.ndarray:
     """Returns a state (S,) with setpoints that pull as little as those of another one: its own, moved along.
 
