@@ -574,11 +574,55 @@ class OwnGenerator(Puck):
         return super().reset(**options)
 
 
+class Lagging(Puck):
+    """Its motors lag behind, and its resets do not set that back."""
+
+    def __init__(self):
+        super().__init__()
+        xml = XML.replace("<motor", '<general dyntype="filter" dynprm="1"')
+        self.model = mujoco.MjModel.from_xml_string(xml)
+        self.data = mujoco.MjData(self.model)
+
+    def reset(self, *, seed=None, options=None):
+        gym.Env.reset(self, seed=seed)
+        self.data.qpos[:], self.data.qvel[:] = [-1.4, 0.5], 0
+        mujoco.mj_forward(self.model, self.data)
+        return self._get_obs(), {}
+
+
+class InTurn(Puck):
+    """Three goals in turn."""
+
+    turn = 0
+
+    def reset(self, **options):
+        self.turn = (self.turn + 1) % 3
+        return super().reset(**options)
+
+    def _get_obs(self):
+        to_goal = GOAL + np.array([0, self.turn]) - self.data.qpos
+        return super()._get_obs() | {"to_goal": to_goal}
+
+
+class Promoted(Puck):
+    """After a success its motors get weaker."""
+
+    level = 0
+
+    def step(self, action):
+        *result, info = super().step(action * 0.8**self.level)
+        self.level += info["success"]
+        return *result, info
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: normalised(False), r"depends on .*obs_rms.*set update_running_mean = False"),
-        (Weakening, "Weakening changes from episode to episode: .* depends on episodes, "),
+        (Lagging, r"Lagging changes .* outlasts resets \(time, act, .* mj_resetData"),
+        (lambda: FlattenObservation(InTurn()), r"changes from .* outlasts resets \(.*turn\)"),
+        (Promoted, r"outlasts resets \(level\), "),
+        (lambda: normalised(False), r"outlasts .*obs_rms.*set update_running_mean = False"),
+        (Weakening, r"outlasts resets \(episodes\), "),
         (
             OwnGenerator,
             r"draws random numbers in reset\(\), from a generator .* not decide \(rng\)",
