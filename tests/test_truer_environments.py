@@ -713,6 +713,19 @@ class Counted(Puck):
         self.action_space = spaces.Discrete(3, start=-1)
 
 
+class Stale(Puck):
+    """Its reset computes nothing of the place that it leads to."""
+
+    def reset(self, *, seed=None, options=None):
+        gym.Env.reset(self, seed=seed)
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:] = self.np_random.uniform((-1.8, -1.2), (-1.0, 1.2))
+        return self._get_obs(), {}
+
+    def _get_obs(self):
+        return super()._get_obs() | {"position": self.data.body("puck").xpos[:2].copy()}
+
+
 class Beginning(Puck):
     """Observes how fast it has gone so far, which at the start is 0 / 0."""
 
@@ -726,6 +739,7 @@ class Beginning(Puck):
     [
         (Levels, {}, "Levels takes a Box of int64 as its actions, .* would be rounded"),
         (Counted, {}, r"counts its actions from -1, .*: let it take Discrete\(3\)"),
+        (Stale, {}, r"of Stale returns observation\[0\] of another place .* mj_forward before it"),
         (Beginning, {}, r"Beginning observes nan in observation\[\d\]"),
         (
             lambda: RecordEpisodeStatistics(Puck()),
