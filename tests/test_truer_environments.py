@@ -29,7 +29,7 @@ from gymnasium.wrappers import (
 
 from hyrl_mj import BadInput, from_callable, from_gymnasium, get_task, simulate
 from hyrl_mj.gym_import import inspection, making
-from hyrl_mj.gym_import.fingerprint import Unknown, fingerprint, is_known
+from hyrl_mj.gym_import.fingerprint import Unknown, fingerprint, is_known, of_model
 from hyrl_mj.gym_import.instance import Instance
 from hyrl_mj.gym_import.opening import Description
 from hyrl_mj.gym_import.specification import EnvironmentSpec
@@ -698,6 +698,14 @@ def test_what_objects_of_c_keep_is_written_down_or_unknown():
     assert not is_known(fingerprint(env, env.model, env.data))
 
 
+def test_what_an_environment_writes_into_its_model_for_itself_is_remembered():
+    xml = '<mujoco><size nuser_geom="1"/><worldbody><geom size="1"/></worldbody></mujoco>'
+    model = mujoco.MjModel.from_xml_string(xml)
+    before = of_model(model)
+    model.geom_user[0, 0] = 1.0
+    assert of_model(model) != before
+
+
 # ---- what an agent and an environment hand to each other
 
 
@@ -726,6 +734,14 @@ class Stale(Puck):
         return super()._get_obs() | {"position": self.data.body("puck").xpos[:2].copy()}
 
 
+class Clock(gym.Wrapper):
+    """Asks the time limit below it."""
+
+    def step(self, action):
+        observation, reward, *rest = self.env.step(action)
+        return observation, reward - self.env._elapsed_steps, *rest
+
+
 class Beginning(Puck):
     """Observes how fast it has gone so far, which at the start is 0 / 0."""
 
@@ -740,6 +756,7 @@ class Beginning(Puck):
         (Levels, {}, "Levels takes a Box of int64 as its actions, .* would be rounded"),
         (Counted, {}, r"counts its actions from -1, .*: let it take Discrete\(3\)"),
         (Stale, {}, r"of Stale returns observation\[0\] of another place .* mj_forward before it"),
+        (lambda: Clock(TimeLimit(Puck(), 60)), {}, "do without TimeLimit, which is left out"),
         (Beginning, {}, r"Beginning observes nan in observation\[\d\]"),
         (
             lambda: RecordEpisodeStatistics(Puck()),
