@@ -204,6 +204,19 @@ class Ahead(Home):
         return float(np.linalg.norm(self.data.qpos[:2] - self.goal)) > 3.0
 
 
+class Towing(Tied):
+    """The load hangs on a rope."""
+
+    xml = Tied.xml.replace('<geom size="0.05"', '<site name="hook"/><geom size="0.05"')
+    xml = xml.replace('<geom type="sphere"', '<site name="tail"/><geom type="sphere"')
+    xml = xml[: xml.index("<equality>")] + xml[xml.index("</equality>") + 11 :]
+    xml = xml.replace(
+        "<actuator>",
+        '<tendon><spatial limited="true" range="0 0.5"><site site="hook"/><site site="tail"/></spatial>'
+        "</tendon><actuator>",
+    )
+
+
 @pytest.mark.parametrize(
     ("make", "given", "message"),
     [
@@ -214,18 +227,60 @@ class Ahead(Home):
         (Setpoint, {"seed": 0}, r"notes where it leads to \(ctrl\[0\], ctrl\[1\]\)"),
         (Centred, {}, r"notes where it leads to \(ctrl\[0\], ctrl\[1\]\)"),
         (Integrated, {}, r"notes where it leads to \(act\[0\], act\[1\]\)"),
+        (Fence, {}, "draws home, or sets it to the place that it leads to, .* first step"),
         (Fence, {"seed": 0}, r"notes where it leads to \(home\)"),
         (Fence, {"seed": 0, "starts": "reset"}, r"notes where it leads to \(home\)"),
         (FenceAtOnePlace, {}, r"notes where it leads to \(home\)"),
         (FenceByDistance, {"seed": 0}, r"notes where it leads to \(most\)"),
         (FenceByRegion, {}, "draws region|goes otherwise after"),
         (FenceByMarker, {"seed": 0}, r"notes where it leads to \(site_pos of its model\)"),
-        (Tied, {"chart": {"x": "x", "y": "y"}}, "equality constraints tie the robot of Tied"),
+        (Tied, {"chart": {"x": "x", "y": "y"}}, "or limits of tendons tie the robot of Tied"),
+        (
+            Towing,
+            {"chart": {"x": "x", "y": "y"}},
+            "tie the robot of Towing to something that stays",
+        ),
     ],
 )
 def test_what_stays_at_the_place_of_the_reset_is_refused(make, given, message):
     with pytest.raises(BadInput, match=message):
         from_gymnasium(make, steps=60, **given)
+
+
+class Moving(gym.Wrapper):
+    """Its resets put the robot to a place of their own."""
+
+    def reset(self, **options):
+        self.env.reset(**options)
+        self.unwrapped.data.qpos[:2] = [-1.5, 0.4]
+        return self.unwrapped._get_obs(), {}
+
+
+class Later(At):
+    """A gate that closes late holds it; it moves without inertia."""
+
+    gate = 4.5
+
+    def step(self, action):
+        before = self.data.qpos.copy()
+        self.data.qpos[:2] += 0.02 * action
+        held = self.data.time > self.gate and (before[0] - 0.9) * (self.data.qpos[0] - 0.9) < 0
+        self.data.time += 0.1
+        mujoco.mj_forward(self.model, self.data)
+        if held or self.data.ncon:
+            self.data.qpos[:] = before
+        off = float(np.linalg.norm(self.data.qpos[:2] - GOAL))
+        return self._get_obs(), -off, False, False, {"success": off < 0.25}
+
+
+def test_a_wrapper_that_moves_the_robot_to_its_own_start_is_refused():
+    with pytest.raises(BadInput, match=r"wrapper of lambda moves the robot in its reset\(\)"):
+        from_gymnasium(lambda: Moving(At()), steps=20, pinned={"qvel[0]": 0.0})
+
+
+def test_a_chart_is_no_state_where_the_time_matters_late():
+    kinds = Later, type("Open", (Later,), {"gate": np.inf})
+    assert [from_gymnasium(kind, steps=100).chart_is_state for kind in kinds] == [False, True]
 
 
 def test_one_place_may_be_noted_where_runs_begin_there_alone():
@@ -342,8 +397,20 @@ class Servo(At):
 PINNED = {"pinned": {"goal": np.array([1.0, 2.0])}}
 
 
+def shared_rewards():
+    return gym.wrappers.NormalizeReward(At())
+
+
 @pytest.mark.parametrize(
-    ("make", "given"), [(Shaped, {"seed": 0}), (Servo, {}), (Posture, {}), (Ahead, PINNED)]
+    ("make", "given"),
+    [
+        (Shaped, {}),
+        (Shaped, {"seed": 0}),
+        (Servo, {}),
+        (shared_rewards, {}),
+        (Posture, {}),
+        (Ahead, PINNED),
+    ],
 )
 def test_what_matters_to_no_run_is_accepted(make, given):
     assert from_gymnasium(make, steps=20, **given).max_steps == 20

@@ -29,7 +29,7 @@ from gymnasium.wrappers import (
 
 from hyrl_mj import BadInput, from_callable, from_gymnasium, get_task, simulate
 from hyrl_mj.gym_import import inspection, making
-from hyrl_mj.gym_import.fingerprint import Unknown, fingerprint, is_known
+from hyrl_mj.gym_import.fingerprint import Unknown, fingerprint, is_known, of_model
 from hyrl_mj.gym_import.instance import Instance
 from hyrl_mj.gym_import.opening import Description
 from hyrl_mj.gym_import.specification import EnvironmentSpec
@@ -574,11 +574,55 @@ class OwnGenerator(Puck):
         return super().reset(**options)
 
 
+class Lagging(Puck):
+    """Its motors lag behind, and its resets do not set that back."""
+
+    def __init__(self):
+        super().__init__()
+        xml = XML.replace("<motor", '<general dyntype="filter" dynprm="1"')
+        self.model = mujoco.MjModel.from_xml_string(xml)
+        self.data = mujoco.MjData(self.model)
+
+    def reset(self, *, seed=None, options=None):
+        gym.Env.reset(self, seed=seed)
+        self.data.qpos[:], self.data.qvel[:] = [-1.4, 0.5], 0
+        mujoco.mj_forward(self.model, self.data)
+        return self._get_obs(), {}
+
+
+class InTurn(Puck):
+    """Three goals in turn."""
+
+    turn = 0
+
+    def reset(self, **options):
+        self.turn = (self.turn + 1) % 3
+        return super().reset(**options)
+
+    def _get_obs(self):
+        to_goal = GOAL + np.array([0, self.turn]) - self.data.qpos
+        return super()._get_obs() | {"to_goal": to_goal}
+
+
+class Promoted(Puck):
+    """After a success its motors get weaker."""
+
+    level = 0
+
+    def step(self, action):
+        *result, info = super().step(action * 0.8**self.level)
+        self.level += info["success"]
+        return *result, info
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: normalised(False), r"depends on .*obs_rms.*set update_running_mean = False"),
-        (Weakening, "Weakening changes from episode to episode: .* depends on episodes, "),
+        (Lagging, r"Lagging changes .* outlasts resets \(time, act, .* mj_resetData"),
+        (lambda: FlattenObservation(InTurn()), r"changes from .* outlasts resets \(.*turn\)"),
+        (Promoted, r"outlasts resets \(level\), "),
+        (lambda: normalised(False), r"outlasts .*obs_rms.*set update_running_mean = False"),
+        (Weakening, r"outlasts resets \(episodes\), "),
         (
             OwnGenerator,
             r"draws random numbers in reset\(\), from a generator .* not decide \(rng\)",
@@ -654,6 +698,14 @@ def test_what_objects_of_c_keep_is_written_down_or_unknown():
     assert not is_known(fingerprint(env, env.model, env.data))
 
 
+def test_what_an_environment_writes_into_its_model_for_itself_is_remembered():
+    xml = '<mujoco><size nuser_geom="1"/><worldbody><geom size="1"/></worldbody></mujoco>'
+    model = mujoco.MjModel.from_xml_string(xml)
+    before = of_model(model)
+    model.geom_user[0, 0] = 1.0
+    assert of_model(model) != before
+
+
 # ---- what an agent and an environment hand to each other
 
 
@@ -661,6 +713,33 @@ class Levels(Puck):
     def __init__(self):
         super().__init__()
         self.action_space = spaces.Box(-4, 4, (2,), dtype=np.int64)
+
+
+class Counted(Puck):
+    def __init__(self):
+        super().__init__()
+        self.action_space = spaces.Discrete(3, start=-1)
+
+
+class Stale(Puck):
+    """Its reset computes nothing of the place that it leads to."""
+
+    def reset(self, *, seed=None, options=None):
+        gym.Env.reset(self, seed=seed)
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:] = self.np_random.uniform((-1.8, -1.2), (-1.0, 1.2))
+        return self._get_obs(), {}
+
+    def _get_obs(self):
+        return super()._get_obs() | {"position": self.data.body("puck").xpos[:2].copy()}
+
+
+class Clock(gym.Wrapper):
+    """Asks the time limit below it."""
+
+    def step(self, action):
+        observation, reward, *rest = self.env.step(action)
+        return observation, reward - self.env._elapsed_steps, *rest
 
 
 class Beginning(Puck):
@@ -675,6 +754,9 @@ class Beginning(Puck):
     ("make", "given", "message"),
     [
         (Levels, {}, "Levels takes a Box of int64 as its actions, .* would be rounded"),
+        (Counted, {}, r"counts its actions from -1, .*: let it take Discrete\(3\)"),
+        (Stale, {}, r"of Stale returns observation\[0\] of another place .* mj_forward before it"),
+        (lambda: Clock(TimeLimit(Puck(), 60)), {}, "do without TimeLimit, which is left out"),
         (Beginning, {}, r"Beginning observes nan in observation\[\d\]"),
         (
             lambda: RecordEpisodeStatistics(Puck()),

@@ -10,7 +10,7 @@ import numpy as np
 from hyrl_mj.errors import BadInput
 from hyrl_mj.gym_import.fingerprint import Fingerprint, differing
 from hyrl_mj.gym_import.instance import Instance
-from hyrl_mj.gym_import.starts import Resets, own_of
+from hyrl_mj.gym_import.starts import Resets, follows, own_of
 from hyrl_mj.gym_import.trials import EPISODES, HELD, SAMPLES
 
 # Resets whose runs are compared, beside those that bring rare values.
@@ -46,11 +46,16 @@ def check_draws(instance: Instance, resets: Resets, met: np.ndarray) -> str:
     left = [n for n in names if n not in changed and n.partition("[")[0] not in changed]
     if left and seed is None:
         how = 'with options of reset as {"reset": {"goal_cell": [6, 6]}}'
-        if positions := {n: 0.1 for n in left if n.startswith(("qpos[", "qvel[", "mocap_pos["))}:
+        if positions := {
+            n: 0.1 for n in left if n.startswith(("qpos[", "qvel[", "mocap_pos[", "userdata["))
+        }:
             how = f"with values as {json.dumps({'pinned': dict(list(positions.items())[:4])})}"
+        of_place = all(follows(instance.spec, instance.model, resets, n) for n in left)
+        noted = ", or sets it to the place that it leads to" if of_place else ""
+        step = ", or let the first step() note the place" if of_place else ""
         raise BadInput(
-            f"each reset of {name} draws {', '.join(left[:8])}, and what is to be done depends on it: pin it"
-            f', {how}, or as the reset with a seed draws it as {{"seed": 0}}'
+            f"each reset of {name} draws {', '.join(left[:8])}{noted}, and what is to be done depends on it: "
+            f'pin it, {how}, or as the reset with a seed draws it as {{"seed": 0}}{step}'
         )
     if instance.draws_globally and (left or kept):
         raise BadInput(
@@ -169,9 +174,11 @@ def _begun(instance: Instance, starts: np.ndarray, seed: int) -> tuple[Fingerpri
         seen = instance.put(start, seed)
         remembered = remembered or instance.memory()
         told.append(seen)
-        for result in instance.wander(rng, samples=100, held=10):
+        for k, result in enumerate(instance.wander(rng, samples=100, held=10)):
             instance.take(result)
-            told += [instance.observation, np.array(instance.report, dtype=float)]
+            # The first reward may be of what shapes it, and alone it is not judged by.
+            first = 0 if k or "reward" in instance.spec.criterion.asked else 1
+            told += [instance.observation, np.array(instance.report[first:], dtype=float)]
     assert remembered is not None
     return remembered, np.concatenate(told)
 

@@ -129,7 +129,7 @@ def _parts_of_model() -> list[str]:
         name
         for name in dir(model)
         if name.startswith(MOVES)
-        and not name.endswith(("_rgba", "_matid", "_group", "_user"))  # how it looks
+        and not name.endswith(("_rgba", "_matid", "_group"))  # how it looks
         and isinstance(getattr(model, name), np.ndarray)
     ]
 

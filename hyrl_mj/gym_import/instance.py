@@ -22,7 +22,15 @@ from hyrl_mj.errors import BadInput, HyrlError, brief
 from hyrl_mj.gym_import import fingerprint as written
 from hyrl_mj.gym_import.expressions import entry
 from hyrl_mj.gym_import.observations import flat, observers, shaped
-from hyrl_mj.gym_import.opening import actions_of, checked_step, made, peeled, physics_of, steps_of
+from hyrl_mj.gym_import.opening import (
+    actions_of,
+    checked_step,
+    layers,
+    made,
+    peeled,
+    physics_of,
+    steps_of,
+)
 from hyrl_mj.gym_import.pausing import Pausing
 from hyrl_mj.gym_import.physics import Physics, set_pins
 from hyrl_mj.gym_import.specification import Derived, EnvironmentSpec
@@ -67,10 +75,15 @@ class Instance:
         physics = physics_of(env)
         assert physics is not None
         self.spec, self.name, self.steps = spec, spec.name, steps_of(env)
-        as_it_is = real and spec.description.steps is None
+        as_it_is, names = (
+            real and spec.description.steps is None,
+            [type(one).__name__ for one in layers(env)],
+        )
         self.env, (self.model, self.data) = env if as_it_is else peeled(env), physics
         self.physics = Physics(self.model, self.data)
         self.inner: Any = self.env.unwrapped
+        kept = [type(one).__name__ for one in layers(self.env)]
+        self._left_out = ", ".join(name for name in names if name not in kept)
         self.is_wrapped = self.env is not self.inner
         self._space, self._actions = self.env.observation_space, actions_of(self.env)
         self._columns = int(spaces.flatdim(self._space))
@@ -119,7 +132,8 @@ class Instance:
         except (Exception, SystemExit) as error:
             told = f" with the options {dict(given)}" if given else ""
             raise BadInput(
-                f"{self.name} cannot be reset{told} ({brief(error)}): change its options of reset"
+                f"{self.name} cannot be reset{told} ({brief(error)}): "
+                f"{'change its options of reset' if given else self._repair(error)}"
             ) from error
         if not isinstance(result, tuple) or len(result) != 2:
             raise BadInput(
@@ -261,7 +275,12 @@ class Instance:
         if self.start is None:
             self.take(result)
         else:
-            self.start, self.observation = None, self._flat(result)
+            start, self.start, self.observation = self.start, None, self._flat(result)
+            if (self.physics.read() != start)[self.spec.places].any():
+                raise BadInput(
+                    f"a wrapper of {self.name} moves the robot in its reset(), so no run begins where it "
+                    "is put: let the reset of the environment itself do so"
+                )
 
     def finish(self) -> None:
         """Refuses an episode in which random numbers were drawn, or what is shared or looked at changed."""
@@ -479,7 +498,7 @@ class Instance:
         """Returns the environment's action for inputs u (m,)."""
         space: Any = self._actions
         if isinstance(space, spaces.Discrete):
-            return int(space.start + round(float(u[0])))
+            return round(float(u[0]))
         return u.astype(space.dtype).reshape(space.shape)
 
     def stepped(self, u: np.ndarray) -> Any:
@@ -495,7 +514,9 @@ class Instance:
                     f"a wrapper of {self.name} copies the environment, and noise reaches no copies: let it "
                     "look ahead in an environment of its own"
                 ) from error
-            raise BadInput(f"step() of {self.name} raises {brief(error)}: repair it") from error
+            raise BadInput(
+                f"step() of {self.name} raises {brief(error)}: {self._repair(error)}"
+            ) from error
         result = checked_step(result, self.name)
         if not self.is_wrapped:
             self.inner_seen = result[0]
@@ -513,6 +534,13 @@ class Instance:
                 f"a step of {self.name} takes {took:.6g} s, and others {dt:.6g} s: let each take as long"
             )
         return result
+
+    def _repair(self, error: BaseException) -> str:
+        """Returns what to do about an error, of which a wrapper that is left out may be the cause."""
+        left_out = self._left_out and isinstance(error, AttributeError)
+        return "repair it" + (
+            f", or let it do without {self._left_out}, which is left out" if left_out else ""
+        )
 
     def take(self, result: Any) -> None:
         """Notes the observation and the report of what a step has returned."""

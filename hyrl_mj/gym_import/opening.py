@@ -277,6 +277,11 @@ def _checked(env: Any, name: str) -> mujoco.MjModel:
             f"{name} takes a Box of {actions.dtype} as its actions, to which an agent's numbers would be "
             "rounded: let it take a Box of floats, or Discrete"
         )
+    if isinstance(actions, spaces.Discrete) and actions.start != 0:
+        raise BadInput(
+            f"{name} counts its actions from {actions.start}, and levels are counted from 0, by SB3, too, so "
+            f"that an agent's numbers would stand for others: let it take Discrete({actions.n})"
+        )
     if isinstance(actions, spaces.Box) and not np.isfinite([actions.low, actions.high]).all():
         raise BadInput(f"{name} takes actions without limits: give its action_space limits")
     return physics[0]

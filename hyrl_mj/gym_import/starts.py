@@ -32,7 +32,7 @@ OF_MODEL = " of its model"
 # Samples of a run from the start of a reset, and by how much it may differ from a run that is put there, as a
 # share of its numbers: rounding.
 NATURAL, SAME = 100, 1e-6
-# By how much equality constraints may be violated more than after resets [m, rad].
+# By how much equality constraints and limits of tendons may be violated more than after resets [m, rad].
 VIOLATED = 1e-3
 
 
@@ -45,7 +45,7 @@ class Resets:
         differ: the names of what is remembered otherwise than after the first reset, each with the seeds that
             bring a value for the first time, `VALUES` at most.
         numbers: (64, k) of the attributes and parts of the model that differ and are numbers, by name.
-        violation: by how much they violate equality constraints at most [m, rad].
+        violation: by how much they violate equality constraints and limits of tendons at most [m, rad].
     """
 
     states: np.ndarray
@@ -104,10 +104,11 @@ def resets_of(instance: Instance) -> Resets:
 
 
 def _violation(instance: Instance) -> float:
-    """Returns by how much equality constraints are violated at most [m, rad]."""
-    data = instance.data
-    of_equality = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
-    return float(np.abs(data.efc_pos[of_equality]).max(initial=0.0))
+    """Returns by how much equality constraints and limits of tendons are violated at most [m, rad]."""
+    kinds, off = instance.data.efc_type, instance.data.efc_pos
+    equal = np.abs(off[kinds == mujoco.mjtConstraint.mjCNSTR_EQUALITY])
+    beyond = -off[kinds == mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON]
+    return float(np.append(equal, beyond).max(initial=0.0))
 
 
 def own_of(spec: EnvironmentSpec, model: mujoco.MjModel) -> np.ndarray:
@@ -152,6 +153,15 @@ def _predicted(terms: np.ndarray, table: np.ndarray) -> Predict | None:
         return np.where(is_plain, of @ plain, np.where(is_square, root, table[0]))
 
     return predict
+
+
+def follows(spec: EnvironmentSpec, model: mujoco.MjModel, resets: Resets, name: str) -> bool:
+    """Returns whether an attribute or a part of the model follows the place that resets lead to."""
+    if (table := resets.numbers.get(name)) is None:
+        return False
+    terms = _terms(spec, model, resets.states)
+    predict = _predicted(terms, table)
+    return predict is not None and np.allclose([predict(of) for of in terms], table, SAME, SAME)
 
 
 def _setpoints(instance: Instance, state: np.ndarray, now: np.ndarray) -> np.ndarray:
@@ -219,7 +229,7 @@ def check_noted(spec: EnvironmentSpec, resets: Resets) -> None:
     Runs are played after the reset as it is, and where what follows the place has been moved along. Both have
     to go alike, to their ends and under inputs that do not change, which lead far away.
     """
-    _check_equalities(spec, resets)
+    _check_ties(spec, resets)
     _check_following(spec, resets)
     _check_led(spec)
     _check_natural(spec, resets)
@@ -229,17 +239,17 @@ def _starts(spec: EnvironmentSpec, rng: np.random.Generator) -> np.ndarray:
     return spec.state_at(spec.anywhere(rng, EPISODES))
 
 
-def _check_equalities(spec: EnvironmentSpec, resets: Resets) -> None:
+def _check_ties(spec: EnvironmentSpec, resets: Resets) -> None:
     instance = Instance(spec)
-    if not instance.model.neq:
+    if not (instance.model.neq or instance.model.tendon_limited.any()):
         return
     for state in _starts(spec, np.random.default_rng(11)):
         instance.put(state)
         if (off := _violation(instance)) > VIOLATED + 2 * resets.violation:
             raise BadInput(
-                f"equality constraints tie the robot of {spec.name} to something that stays where its "
-                f"reset leads to: at another start on the chart they are off by {off:.3g} m or rad. Leave "
-                "them out, or name a chart of what they tie together"
+                f"equality constraints or limits of tendons tie the robot of {spec.name} to something that "
+                f"stays where its reset leads to: at another start on the chart they are off by {off:.3g} m "
+                "or rad. Leave them out, name a chart of what they tie together, or give its bounds"
             )
 
 
@@ -304,8 +314,10 @@ def _check_following(spec: EnvironmentSpec, resets: Resets) -> None:
 def _renewed(instance: Instance) -> Instance:
     """Returns what can play another run: an instance, or a new one if something outlasts its resets."""
     instance.noted = None
-    worn = instance.spec.anew or instance.renew()
-    return Instance(instance.spec) if worn else instance
+    if instance.spec.anew or instance.renew():
+        instance = Instance(instance.spec)
+        instance.renew()  # what it is like when it is new
+    return instance
 
 
 # What is seen, and the inputs (m,) that go on from there.

@@ -152,46 +152,76 @@ def changes_by_reset(spec: EnvironmentSpec) -> bool:
 def check_episodes(spec: EnvironmentSpec) -> None:
     """Raises `BadInput` if what outlasts resets changes what is observed or done in later episodes.
 
-    Each episode is played by an environment that is like new, and its user's goes on with what it remembers.
+    Each episode is played by an environment that is like new, and its user's goes on with what it remembers,
+    here after one episode, and after several that begin all over the chart, too, where some may succeed.
     """
-    rng, none = np.random.default_rng(13), np.zeros((SAMPLES + 1, spec.dimension))
-    new, twin, old = (Instance(spec) for _ in range(3))
-    inputs = [new.drawn(rng) for _ in range(SAMPLES)]
-    for _ in range(3):
-        old.reset()
-        for _ in old.wander(rng, SAMPLES, HELD):
-            pass
-    runs = [one.play(spec.state, inputs, none) for one in (new, twin, old)]
+    rng, names = np.random.default_rng(13), dict[str, None]()
+    once, several = Instance(spec), Instance(spec)
+    for old, episodes in ((once, 1), (several, 3)):
+        for _ in range(episodes):
+            old.reset()
+            deque(old.wander(rng, SAMPLES, HELD), maxlen=0)
+    for state in spec.state_at(spec.anywhere(rng, 2 * EPISODES)):
+        several.put(state)
+        if several.physics.depth(spec.solid) <= spec.depth:
+            deque(several.wander(rng, SAMPLES, HELD), maxlen=0)
+    for old in (once, several):
+        names |= dict.fromkeys(_outlasting(spec, old, rng))
+    if names:
+        spec.found["episodes"] = (
+            f"each is played by a new environment, because {', '.join([*names][:4])} outlasts resets; no "
+            f"trial of {3 + 2 * EPISODES} episodes shows that what comes next depends on it"
+        )
+
+
+def _outlasting(spec: EnvironmentSpec, old: Instance, rng: np.random.Generator) -> list[str]:
+    """Returns the names of what outlasts the resets of an instance; raises `BadInput` if a run depends on it.
+
+    A run begins as the reset of each instance leaves MuJoCo's state, at one place.
+    """
+    new, twin = Instance(spec), Instance(spec)
+    inputs, none = [new.drawn(rng) for _ in range(SAMPLES)], np.zeros((SAMPLES + 1, spec.dimension))
+    starts, columns = [], new.physics.columns
+    for one in (new, twin, old):
+        one.reset()
+        starts.append(one.physics.read())
+        for at in (spec.places, columns["warmstart"]):
+            starts[-1][at] = spec.state[at]
+    runs = [
+        one.play(start, inputs, none) for one, start in zip((new, twin, old), starts, strict=True)
+    ]
     seen = [next(run) for run in runs]
     remembered = [one.memory() for one in (new, twin, old)]
     usual = {*differing(*remembered[:2])}  # such as names of files
     names = [name for name in differing(remembered[2], remembered[0]) if name not in usual]
+    names += [n for n, at in columns.items() if not np.array_equal(starts[2][at], starts[0][at])]
     if drawn := [name for name in names if name in remembered[0].generators]:
         raise BadInput(
             f"{spec.name} draws random numbers in reset(), from a generator that its seed does not decide "
             f"({drawn[0]}): let it draw from self.np_random"
         )
-    if names:
-        spec.found["episodes"] = (
-            f"each is played by a new environment, because {', '.join(names[:4])} outlasts resets; no trial "
-            "of three episodes shows that what comes next depends on it"
-        )
     first = 0 if "reward" in spec.criterion.asked else 1  # of the report, by which it is judged
     while len(seen) == len(runs):
-        told = [np.concatenate([one.state, one.observation, one.report[first:]]) for one in seen]
+        told = [
+            np.concatenate([one.state[spec.places], one.observation, one.report[first:]])
+            for one in seen
+        ]
         if not np.array_equal(told[0], told[1], equal_nan=True):
-            return  # it goes another way each time, as is found elsewhere
+            break  # it goes another way each time, as is found elsewhere
         most, known = 1e-6 * np.maximum(np.abs(told[0]), 1.0), np.isfinite(told[0])
         if not (np.abs(told[2] - told[0]) <= most).all(where=known):
-            what = names[0] if names else "something that no attribute holds"
+            what = ", ".join(names[:4]) or "no attribute tells what"
             how = "let reset() set it back"
             if what.startswith("NormalizeObservation"):
                 how = "load its statistics (obs_rms) and set update_running_mean = False where it is made"
+            elif names and names[0] in columns:
+                how = "let reset() call mj_resetData"
             raise BadInput(
-                f"{spec.name} changes from episode to episode: what is observed or done depends on {what}, "
-                f"which outlasts resets, and here each episode is played by a new environment; {how}"
+                f"{spec.name} changes from episode to episode: what is observed or done depends on what "
+                f"outlasts resets ({what}), and here each episode is played by a new environment; {how}"
             )
         seen = [] if any(seen[0].report[1:3]) else [one for run in runs for one in islice(run, 1)]
+    return names
 
 
 def check_told(spec: EnvironmentSpec) -> None:
