@@ -23,10 +23,14 @@ class HyrlError(Exception):
     exit_status = 1
 
     def __init__(self, text: object = "") -> None:
-        whole = str(text)
-        if len(whole) > LONGEST:
-            whole = f"{whole[: LONGEST // 2]} [...] {whole[-LONGEST // 2 :]}"
-        super().__init__(printable(whole))
+        # Escapes are longer than what they stand for, and a text that is far too long takes long to escape.
+        super().__init__(_cut(printable(_cut(str(text)))))
+
+
+def _cut(text: str) -> str:
+    """Returns a text without its middle, if it is too long."""
+    half = LONGEST // 2
+    return text if len(text) <= LONGEST else f"{text[:half]} [...] {text[-half:]}"
 
 
 class BadInput(HyrlError, ValueError):

@@ -1,6 +1,8 @@
 """Files that lie in the way, fill the memory, speak to the terminal, or belong to somebody else."""
 
+import contextlib
 import csv
+import io
 import json
 import multiprocessing
 import os
@@ -32,7 +34,7 @@ from hyrl_mj.policies import algorithms
 from hyrl_mj.policies.preprocessing import Normalization
 from hyrl_mj.runs.sweeps import MOST_RUNS, Common, Row, Setting, Sweep
 from hyrl_mj.system import limits
-from hyrl_mj.system.streams import _SEQUENCES
+from hyrl_mj.system.streams import _SEQUENCES, Streams
 from hyrl_mj.tasks import described_task, registry
 from hyrl_mj.tasks.scaffold import write_task
 from hyrl_mj.viz import report
@@ -179,6 +181,31 @@ def test_the_hint_of_a_new_task_can_be_copied(tmp_path):
     done = call("new-task", "robot_2", "--folder", "a b\nc", cwd=tmp_path)
     assert done.stdout.count("\n") == 3
     assert "hyrl-mj run 'a b\\nc/robot_2.py'\n" in done.stdout
+
+
+def test_a_path_that_no_file_can_have_is_one_sentence(tmp_path):
+    (tmp_path / "loop").symlink_to("loop")
+    for path in ("x" * 300, "a/" * 3_000, "\u202e" * 90, "loop/x.py", "a\n" * 200):
+        for words in (("report", path), ("run", "unit_circle", "--out", path), ("noise", path)):
+            done = call(*words, cwd=tmp_path)
+            assert done.returncode == 2, words
+            assert done.stderr.startswith("hyrl-mj: ")
+            assert done.stderr.count("\n") == 1
+            assert len(done.stderr) < 530
+
+
+def test_a_full_memory_is_one_sentence():
+    def work():
+        raise MemoryError
+
+    err = io.StringIO()
+    with contextlib.redirect_stderr(err):
+        assert Streams().run(work) == 1
+    assert err.getvalue().startswith("hyrl-mj: there is not enough memory")
+
+
+def test_a_sentence_is_short_also_with_escapes():
+    assert len(str(BadInput("\U000e0001" * 500))) <= 510
 
 
 @pytest.mark.slow
