@@ -11,6 +11,8 @@ from unicodedata import category
 
 # The longest text of an error [characters]: what is longer holds something of a file that nobody reads.
 LONGEST = 500
+# The largest number that a user gives: its square is a number, too.
+LARGEST_NUMBER = 1e30
 
 
 class HyrlError(Exception):
@@ -119,8 +121,10 @@ def check_bound(bound: float) -> float:
     """Returns the noise bound, if it can be used.
 
     Raises:
-        BadInput: it is negative, infinite or not a number.
+        BadInput: it is negative, far too large or not a number.
     """
     if not (isinstance(bound, Real) and math.isfinite(bound) and bound >= 0):
         raise BadInput(f"noise bound {bound!r} cannot be used: give a finite number >= 0")
+    if bound > LARGEST_NUMBER:
+        raise BadInput(f"noise bound {bound:g} cannot be used: give at most {LARGEST_NUMBER:g}")
     return float(bound)
