@@ -33,6 +33,7 @@ from hyrl_mj.physics import mjcf
 from hyrl_mj.policies import algorithms
 from hyrl_mj.policies.preprocessing import Normalization
 from hyrl_mj.runs.sweeps import MOST_RUNS, Common, Row, Setting, Sweep
+from hyrl_mj.stages import ExtendedSets
 from hyrl_mj.system import limits
 from hyrl_mj.system.streams import _SEQUENCES, Streams
 from hyrl_mj.tasks import described_task, registry
@@ -104,6 +105,18 @@ def test_a_link_that_leads_to_nothing_is_not_replaced(tmp_path):
     path = tmp_path / "a.html"
     path.symlink_to(tmp_path / "elsewhere.html")
     with pytest.raises(BadInput, match="has not written it"), trust.output(path):
+        pass
+
+
+def test_a_new_task_replaces_no_link_that_leads_to_nothing(tmp_path):
+    (tmp_path / "robot_3.xml").symlink_to(tmp_path / "elsewhere.xml")
+    with pytest.raises(BadInput, match="exists already"):
+        write_task("robot_3", tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["robot_3.xml"]
+
+
+def test_a_path_without_a_name_is_one_sentence():
+    with pytest.raises(BadInput, match="is no name of a file"), artifacts.replacing(Path()):
         pass
 
 
@@ -370,6 +383,15 @@ def test_statistics_are_numbers_of_a_size_that_can_be_reckoned_with(arrays, mess
     np.savez(tmp_path / "s.npz", **usual | arrays)
     with pytest.raises(BadArtifact, match=message):
         Normalization.load(tmp_path / "s.npz")
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("modes", [np.array([0, 1j]), np.array([0.0, 0.5])])
+def test_modes_are_integers(modes, planted_circle, tmp_path):
+    with np.load(planted_circle[0].path / "extended_sets.npz", allow_pickle=False) as arrays:
+        np.savez(tmp_path / "e.npz", **{**arrays, "modes": modes})
+    with pytest.raises(BadArtifact, match="its modes cannot be used: its numbers are no integers"):
+        ExtendedSets.load(tmp_path / "e.npz", hyrl_mj.get_task("unit_circle"))
 
 
 def test_an_arc_is_as_long_as_its_run_at_most(planted_circle, tmp_path):
