@@ -22,6 +22,7 @@ from PIL import Image
 
 import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, from_gymnasium
+from hyrl_mj.cli import parsing
 from hyrl_mj.fields import read_field
 from hyrl_mj.files import artifacts, trust
 from hyrl_mj.files.manifest import Manifest, locked
@@ -30,7 +31,7 @@ from hyrl_mj.gym_import import making
 from hyrl_mj.gym_import.making import explained
 from hyrl_mj.gym_import.opening import with_arrays
 from hyrl_mj.physics import mjcf
-from hyrl_mj.policies import algorithms
+from hyrl_mj.policies import agent_at, algorithms
 from hyrl_mj.policies.preprocessing import Normalization
 from hyrl_mj.runs.sweeps import MOST_RUNS, Common, Row, Setting, Sweep
 from hyrl_mj.stages import ExtendedSets
@@ -146,6 +147,14 @@ def test_code_that_a_file_names_is_not_even_read(tmp_path, monkeypatch):
     assert len(digest_of(path)) == 64
 
 
+def test_the_name_of_a_file_that_is_missing_is_no_module(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "evil_agent.py").write_text("open('executed', 'w')")
+    with pytest.raises(BadArtifact, match=r"there is no file evil_agent:best\.zip"):
+        agent_at(Path("evil_agent:best.zip"))
+    assert not (tmp_path / "executed").exists()
+
+
 def test_a_command_that_is_shown_can_be_copied(tmp_path):
     with pytest.raises(BadInput, match=r"--algorithm '\$\(touch x\):X'$"):
         algorithms.check_named("$(touch x):X")
@@ -163,6 +172,11 @@ def test_a_name_of_a_video_is_no_protocol(name, tmp_path, monkeypatch):
     with video(Path(name), 16, 16, 5) as add:
         add(np.zeros((16, 16, 3), dtype=np.uint8))
     assert os.listdir(tmp_path) == [name]
+
+
+def test_options_are_shown_without_docstrings():  # as under PYTHONOPTIMIZE=2
+    option = parsing.Argument("eps", parsing.KINDS[float], None, "a number", positional=False)
+    assert option.field(helping=True)[0] == "eps"
 
 
 def test_a_name_is_no_formula(tmp_path, circle):
@@ -343,6 +357,18 @@ def test_arguments_of_an_environment_have_a_limit(tmp_path):
     done = call("diagnose", "--explain", "--env", ENV, "--env-args", "large.json", cwd=tmp_path)
     assert done.returncode == 2
     assert "is larger than 4 MiB" in done.stderr
+
+
+@pytest.mark.parametrize("name", ["interval_s", "time_s"])
+def test_what_is_divided_by_is_not_tiny(name, tmp_path):
+    field = {
+        "goal_m": [5, 0],
+        "posts": [{"radius_m": 0.2, "positions_m": [[0, 0]]}],
+        "starts": [{"position_m": [-5, 0], "heading_rad": 0}],
+    }
+    (tmp_path / "tiny.json").write_text(json.dumps(field | {name: 1e-320}))
+    with pytest.raises(BadInput, match="> 0, from 1e-09 to 3600 s"):
+        read_field(tmp_path / "tiny.json")
 
 
 def test_runs_in_a_field_have_a_longest_time_together(tmp_path):
