@@ -411,8 +411,15 @@ def test_statistics_are_numbers_of_a_size_that_can_be_reckoned_with(arrays, mess
         Normalization.load(tmp_path / "s.npz")
 
 
+@pytest.mark.parametrize("kind", [complex, "m8[s]", "S1", [("a", float)]])
+def test_arrays_of_a_run_hold_real_numbers_or_texts(kind, tmp_path):
+    artifacts.write_arrays(tmp_path / "a.npz", {"a": np.zeros(2, dtype=kind)}, "kind")
+    with pytest.raises(BadArtifact, match="its a holds neither real numbers nor a text"):
+        artifacts.read_arrays(tmp_path / "a.npz", "kind")
+
+
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("modes", [np.array([0, 1j]), np.array([0.0, 0.5])])
+@pytest.mark.parametrize("modes", [np.array([0.0, 1.0]), np.array([0.0, 0.5])])
 def test_modes_are_integers(modes, planted_circle, tmp_path):
     with np.load(planted_circle[0].path / "extended_sets.npz", allow_pickle=False) as arrays:
         np.savez(tmp_path / "e.npz", **{**arrays, "modes": modes})

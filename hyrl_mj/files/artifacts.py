@@ -361,6 +361,9 @@ def read_arrays(path: Path, kind: str, limit: int = LARGEST) -> dict[str, np.nda
     with reading(path):
         check_size(path.stat().st_size)
         content = archives.read_npz(path, limit)
+        for name, array in content.items():
+            if array.dtype.kind not in "biufU":
+                raise BadArtifact(f"its {name} holds neither real numbers nor a text: {REMEDY}")
         check_version(int(content.pop("version")), str(content.pop("kind")), kind)
         return content
 
