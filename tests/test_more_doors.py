@@ -147,6 +147,29 @@ def test_code_that_a_file_names_is_not_even_read(tmp_path, monkeypatch):
     assert len(digest_of(path)) == 64
 
 
+def test_a_session_in_a_folder_of_a_stranger_takes_no_package_from_it(tmp_path):
+    for name in ("gymnasium_robotics", "ogbench", "shimmy", "evil_task"):
+        (tmp_path / f"{name}.py").write_text("open('executed', 'w').close()")
+    (tmp_path / "evil-1.dist-info").mkdir()
+    text = "[hyrl_mj.tasks]\nevil = evil_task:Task\n"
+    (tmp_path / "evil-1.dist-info" / "entry_points.txt").write_text(text)
+    (tmp_path / "evil-1.dist-info" / "METADATA").write_text("Name: evil\nVersion: 1\n")
+    code = """if True:
+        from hyrl_mj.errors import BadInput
+        from hyrl_mj.tasks import described_task
+        for name in ('evil', 'env:{"env": "NoSuch-v4"}'):
+            try:
+                described_task(name)
+            except BadInput:
+                print("refused")
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "refused\n" * 2
+    assert not (tmp_path / "executed").exists()
+
+
 def test_the_name_of_a_file_that_is_missing_is_no_module(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "evil_agent.py").write_text("open('executed', 'w')")
