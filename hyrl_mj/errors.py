@@ -11,6 +11,8 @@ from unicodedata import category
 
 # The longest text of an error [characters]: what is longer holds something of a file that nobody reads.
 LONGEST = 500
+# The largest number that a user gives: its square is a number, too.
+LARGEST_NUMBER = 1e30
 
 
 class HyrlError(Exception):
@@ -23,10 +25,14 @@ class HyrlError(Exception):
     exit_status = 1
 
     def __init__(self, text: object = "") -> None:
-        whole = str(text)
-        if len(whole) > LONGEST:
-            whole = f"{whole[: LONGEST // 2]} [...] {whole[-LONGEST // 2 :]}"
-        super().__init__(printable(whole))
+        # Escapes are longer than what they stand for, and a text that is far too long takes long to escape.
+        super().__init__(_cut(printable(_cut(str(text)))))
+
+
+def _cut(text: str) -> str:
+    """Returns a text without its middle, if it is too long."""
+    half = LONGEST // 2
+    return text if len(text) <= LONGEST else f"{text[:half]} [...] {text[-half:]}"
 
 
 class BadInput(HyrlError, ValueError):
@@ -115,8 +121,10 @@ def check_bound(bound: float) -> float:
     """Returns the noise bound, if it can be used.
 
     Raises:
-        BadInput: it is negative, infinite or not a number.
+        BadInput: it is negative, far too large or not a number.
     """
     if not (isinstance(bound, Real) and math.isfinite(bound) and bound >= 0):
         raise BadInput(f"noise bound {bound!r} cannot be used: give a finite number >= 0")
+    if bound > LARGEST_NUMBER:
+        raise BadInput(f"noise bound {bound:g} cannot be used: give at most {LARGEST_NUMBER:g}")
     return float(bound)

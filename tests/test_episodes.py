@@ -137,6 +137,7 @@ def test_batches_add_up_and_none_is_the_same(vehicle, on_vehicle, monkeypatch):
     [
         (Noise("uniform", 0.1), 0, "0 episodes cannot be simulated"),
         (Noise("uniform", 0.1), -5, "-5 episodes cannot be simulated"),
+        (Noise("uniform", 0.1), 10**30, "at most 1,000,000,000"),
         (Noise("uniform", 1.5), 10, "noise bound 1.5 hides the whole state space of vehicle"),
     ],
 )

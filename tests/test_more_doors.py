@@ -1,6 +1,8 @@
 """Files that lie in the way, fill the memory, speak to the terminal, or belong to somebody else."""
 
+import contextlib
 import csv
+import io
 import json
 import multiprocessing
 import os
@@ -20,6 +22,7 @@ from PIL import Image
 
 import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, from_gymnasium
+from hyrl_mj.cli import parsing
 from hyrl_mj.fields import read_field
 from hyrl_mj.files import artifacts, trust
 from hyrl_mj.files.manifest import Manifest, locked
@@ -28,11 +31,12 @@ from hyrl_mj.gym_import import making
 from hyrl_mj.gym_import.making import explained
 from hyrl_mj.gym_import.opening import with_arrays
 from hyrl_mj.physics import mjcf
-from hyrl_mj.policies import algorithms
+from hyrl_mj.policies import agent_at, algorithms
 from hyrl_mj.policies.preprocessing import Normalization
 from hyrl_mj.runs.sweeps import MOST_RUNS, Common, Row, Setting, Sweep
+from hyrl_mj.stages import ExtendedSets
 from hyrl_mj.system import limits
-from hyrl_mj.system.streams import _SEQUENCES
+from hyrl_mj.system.streams import _SEQUENCES, Streams
 from hyrl_mj.tasks import described_task, registry
 from hyrl_mj.tasks.scaffold import write_task
 from hyrl_mj.viz import report
@@ -105,6 +109,18 @@ def test_a_link_that_leads_to_nothing_is_not_replaced(tmp_path):
         pass
 
 
+def test_a_new_task_replaces_no_link_that_leads_to_nothing(tmp_path):
+    (tmp_path / "robot_3.xml").symlink_to(tmp_path / "elsewhere.xml")
+    with pytest.raises(BadInput, match="exists already"):
+        write_task("robot_3", tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["robot_3.xml"]
+
+
+def test_a_path_without_a_name_is_one_sentence():
+    with pytest.raises(BadInput, match="is no name of a file"), artifacts.replacing(Path()):
+        pass
+
+
 # ---- code
 
 
@@ -131,6 +147,37 @@ def test_code_that_a_file_names_is_not_even_read(tmp_path, monkeypatch):
     assert len(digest_of(path)) == 64
 
 
+def test_a_session_in_a_folder_of_a_stranger_takes_no_package_from_it(tmp_path):
+    for name in ("gymnasium_robotics", "ogbench", "shimmy", "evil_task"):
+        (tmp_path / f"{name}.py").write_text("open('executed', 'w').close()")
+    (tmp_path / "evil-1.dist-info").mkdir()
+    text = "[hyrl_mj.tasks]\nevil = evil_task:Task\n"
+    (tmp_path / "evil-1.dist-info" / "entry_points.txt").write_text(text)
+    (tmp_path / "evil-1.dist-info" / "METADATA").write_text("Name: evil\nVersion: 1\n")
+    code = """if True:
+        from hyrl_mj.errors import BadInput
+        from hyrl_mj.tasks import described_task
+        for name in ('evil', 'env:{"env": "NoSuch-v4"}'):
+            try:
+                described_task(name)
+            except BadInput:
+                print("refused")
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "refused\n" * 2
+    assert not (tmp_path / "executed").exists()
+
+
+def test_the_name_of_a_file_that_is_missing_is_no_module(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "evil_agent.py").write_text("open('executed', 'w')")
+    with pytest.raises(BadArtifact, match=r"there is no file evil_agent:best\.zip"):
+        agent_at(Path("evil_agent:best.zip"))
+    assert not (tmp_path / "executed").exists()
+
+
 def test_a_command_that_is_shown_can_be_copied(tmp_path):
     with pytest.raises(BadInput, match=r"--algorithm '\$\(touch x\):X'$"):
         algorithms.check_named("$(touch x):X")
@@ -148,6 +195,11 @@ def test_a_name_of_a_video_is_no_protocol(name, tmp_path, monkeypatch):
     with video(Path(name), 16, 16, 5) as add:
         add(np.zeros((16, 16, 3), dtype=np.uint8))
     assert os.listdir(tmp_path) == [name]
+
+
+def test_options_are_shown_without_docstrings():  # as under PYTHONOPTIMIZE=2
+    option = parsing.Argument("eps", parsing.KINDS[float], None, "a number", positional=False)
+    assert option.field(helping=True)[0] == "eps"
 
 
 def test_a_name_is_no_formula(tmp_path, circle):
@@ -179,6 +231,31 @@ def test_the_hint_of_a_new_task_can_be_copied(tmp_path):
     done = call("new-task", "robot_2", "--folder", "a b\nc", cwd=tmp_path)
     assert done.stdout.count("\n") == 3
     assert "hyrl-mj run 'a b\\nc/robot_2.py'\n" in done.stdout
+
+
+def test_a_path_that_no_file_can_have_is_one_sentence(tmp_path):
+    (tmp_path / "loop").symlink_to("loop")
+    for path in ("x" * 300, "a/" * 3_000, "\u202e" * 90, "loop/x.py", "a\n" * 200):
+        for words in (("report", path), ("run", "unit_circle", "--out", path), ("noise", path)):
+            done = call(*words, cwd=tmp_path)
+            assert done.returncode == 2, words
+            assert done.stderr.startswith("hyrl-mj: ")
+            assert done.stderr.count("\n") == 1
+            assert len(done.stderr) < 530
+
+
+def test_a_full_memory_is_one_sentence():
+    def work():
+        raise MemoryError
+
+    err = io.StringIO()
+    with contextlib.redirect_stderr(err):
+        assert Streams().run(work) == 1
+    assert err.getvalue().startswith("hyrl-mj: there is not enough memory")
+
+
+def test_a_sentence_is_short_also_with_escapes():
+    assert len(str(BadInput("\U000e0001" * 500))) <= 510
 
 
 @pytest.mark.slow
@@ -305,6 +382,18 @@ def test_arguments_of_an_environment_have_a_limit(tmp_path):
     assert "is larger than 4 MiB" in done.stderr
 
 
+@pytest.mark.parametrize("name", ["interval_s", "time_s"])
+def test_what_is_divided_by_is_not_tiny(name, tmp_path):
+    field = {
+        "goal_m": [5, 0],
+        "posts": [{"radius_m": 0.2, "positions_m": [[0, 0]]}],
+        "starts": [{"position_m": [-5, 0], "heading_rad": 0}],
+    }
+    (tmp_path / "tiny.json").write_text(json.dumps(field | {name: 1e-320}))
+    with pytest.raises(BadInput, match="> 0, from 1e-09 to 3600 s"):
+        read_field(tmp_path / "tiny.json")
+
+
 def test_runs_in_a_field_have_a_longest_time_together(tmp_path):
     field = {
         "goal_m": [500, 500],
@@ -343,6 +432,22 @@ def test_statistics_are_numbers_of_a_size_that_can_be_reckoned_with(arrays, mess
     np.savez(tmp_path / "s.npz", **usual | arrays)
     with pytest.raises(BadArtifact, match=message):
         Normalization.load(tmp_path / "s.npz")
+
+
+@pytest.mark.parametrize("kind", [complex, "m8[s]", "S1", [("a", float)]])
+def test_arrays_of_a_run_hold_real_numbers_or_texts(kind, tmp_path):
+    artifacts.write_arrays(tmp_path / "a.npz", {"a": np.zeros(2, dtype=kind)}, "kind")
+    with pytest.raises(BadArtifact, match="its a holds neither real numbers nor a text"):
+        artifacts.read_arrays(tmp_path / "a.npz", "kind")
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("modes", [np.array([0.0, 1.0]), np.array([0.0, 0.5])])
+def test_modes_are_integers(modes, planted_circle, tmp_path):
+    with np.load(planted_circle[0].path / "extended_sets.npz", allow_pickle=False) as arrays:
+        np.savez(tmp_path / "e.npz", **{**arrays, "modes": modes})
+    with pytest.raises(BadArtifact, match="its modes cannot be used: its numbers are no integers"):
+        ExtendedSets.load(tmp_path / "e.npz", hyrl_mj.get_task("unit_circle"))
 
 
 def test_an_arc_is_as_long_as_its_run_at_most(planted_circle, tmp_path):

@@ -267,6 +267,13 @@ STRANGE = {
     "is no CSV file": 't,x,x_ref\n0,"1,2\n' + ROWS,
     "with control characters": "t,x\x1b[2J,x_ref\n" + ROWS,
     "is no text": b"\x89PNG\0\xff",
+    "no finite number up to 1e+30": "t,x,x_ref\n0,-1e307,1\n" + ROWS,
+    "x never changes": "t,x,x_ref\n"
+    + "".join(f"{k},{k % 7}e-320,{k % 5}e-320\n" for k in range(100)),
+    "a time of 1e-300 s between rows": "t,x,x_ref\n"
+    + "".join(f"{k}e-300,{k % 7},{k % 5}\n" for k in range(100)),
+    "names of up to 100,000 characters": "t,x,x_ref," + "a" * 100_000 + "\n" + ROWS,
+    "500,000 names": ",".join(f"c{k}" for k in range(500_000)) + "\n" + ROWS,
 }
 
 
@@ -291,6 +298,8 @@ def test_files_of_strangers_are_a_sentence(what, tmp_path):
         (["--share", "2"], "from 0.5 to 1"),
         (["--dt", "0.05"], "leave --dt out"),
         (["--dt", "0"], "give one > 0"),
+        (["--dt", "1e308"], "give one > 0"),
+        (["--scale", "x=1e308"], "give a factor"),
         (["--out", "a.pdf"], "ends in .png"),
     ],
 )

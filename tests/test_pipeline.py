@@ -198,6 +198,7 @@ def test_episodes_are_added_on_demand(run):
     ("options", "message"),
     [
         ({"episodes": 0}, "0 episodes cannot be simulated"),
+        ({"seed": -1}, "seed -1 cannot be used"),
         ({"eps": -0.1}, "finite number >= 0"),
         ({"eps": 100.0}, "hides the whole state space"),
         ({"noise": ("pink",)}, "'pink'"),

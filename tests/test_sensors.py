@@ -175,6 +175,9 @@ BAD = {
     "unifrom 0.1": "Did you mean 'uniform'",
     "sensor 0.1": "unknown part of a sensor",
     "uniform 0.1 +": "unknown part of a sensor ''",
+    "uniform 1e308 + bias 1e308": r"give at most 1e\+30",
+    "uniform 0.1 + quantum 1e-320": r"give numbers from 1e-30 to 1e\+30",
+    "+".join(["bias 0"] * 21): "has 21 parts: give at most 20",
 }
 
 

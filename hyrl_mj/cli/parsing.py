@@ -146,7 +146,9 @@ class Argument:
         """
         text, _, by_default = self.text.rstrip(".").partition("; by default ")
         required = self.default is MISSING
-        hint = "required" if required else f"default: {by_default or self.kind.show(self.default)}"
+        # Python leaves the texts out if it is asked to, as by PYTHONOPTIMIZE=2.
+        usual = by_default or ("none" if self.default is None else self.kind.show(self.default))
+        hint = "required" if required else f"default: {usual}"
         shown = tyro.conf.arg(help=f"{text}.", help_behavior_hint=f"({hint})")
         if self.kind is FLAG:
             return self.name, Annotated[bool, shown], False

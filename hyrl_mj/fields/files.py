@@ -18,6 +18,7 @@ from hyrl_mj.tasks import Layouts, wrapped
 # How far from the origin anything may be, and the largest radius [m]; the longest run and time between two
 # positions [s].
 FARTHEST, LONGEST = 1_000.0, 3_600.0
+LEAST = 1e-9  # of what is positive: what is divided by it is a number, too
 # How many posts a field may have, so that the memory suffices.
 MOST_POSTS = 100
 # What the keys hold.
@@ -182,9 +183,9 @@ class _Part:
         """Returns a number of that magnitude at most, or raises `BadInput`."""
         # In Python true and false are numbers. NaN is not within any limits.
         is_number = isinstance(self.value, int | float) and not isinstance(self.value, bool)
-        if is_number and -most <= self.value <= most and not (positive and self.value <= 0):
+        if is_number and -most <= self.value <= most and not (positive and self.value < LEAST):
             return float(self.value)
-        limits = f"> 0 and at most {most:g}" if positive else f"from {-most:g} to {most:g}"
+        limits = f"> 0, from {LEAST:g} to {most:g}" if positive else f"from {-most:g} to {most:g}"
         raise self._refused(f"a number {limits} {unit}")
 
     def _refused(self, meaning: str) -> BadInput:

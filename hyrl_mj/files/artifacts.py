@@ -53,6 +53,8 @@ def replacing(path: Path) -> Iterator[Path]:
     Raises:
         BadInput: the path cannot be written.
     """
+    if not path.name:
+        raise BadInput(f"{path} is no name of a file: give one")
     temporary = path.with_name(f".{path.stem}.{secrets.token_hex(6)}.partial{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -330,6 +332,8 @@ def _unpacked(name: str, declared: Any, arrays: Mapping[str, np.ndarray], contex
     if declared in (tuple[int, ...], tuple[np.ndarray, ...]):
         if len(array) > MOST_ROWS:
             raise ValueError(f"it has {len(array):,} rows, at most {MOST_ROWS:,} make sense")
+        if declared == tuple[int, ...] and array.size and array.dtype.kind not in "iu":
+            raise ValueError("its numbers are no integers")
         return tuple(int(value) for value in array) if array.ndim == 1 else tuple(array)
     if declared is np.ndarray:
         return array
@@ -357,6 +361,9 @@ def read_arrays(path: Path, kind: str, limit: int = LARGEST) -> dict[str, np.nda
     with reading(path):
         check_size(path.stat().st_size)
         content = archives.read_npz(path, limit)
+        for name, array in content.items():
+            if array.dtype.kind not in "biufU":
+                raise BadArtifact(f"its {name} holds neither real numbers nor a text: {REMEDY}")
         check_version(int(content.pop("version")), str(content.pop("kind")), kind)
         return content
 

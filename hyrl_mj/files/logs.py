@@ -12,12 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
-from hyrl_mj.errors import BadInput, brief, has_controls
+from hyrl_mj.errors import LARGEST_NUMBER, BadInput, brief, has_controls
 from hyrl_mj.files import artifacts
 
 LARGEST = 2**26  # [bytes]: a million rows of six columns
 NEEDED = "give a CSV file with a line of names and a row for each sample"
 SHOWN = 40  # characters of a cell or a name in a message
+LONGEST, MOST = 200, 10_000  # characters of a name, and names
 
 
 class Log:
@@ -79,6 +80,11 @@ def _check(path: str | Path, header: Sequence[str]) -> None:
     """Raises `BadInput` unless the first line of a file names its columns."""
     if not any(header):
         raise BadInput(f"{path} is empty or begins with an empty line: {NEEDED}")
+    if len(header) > MOST or max(map(len, header)) > LONGEST:
+        raise BadInput(
+            f"{path} has {len(header):,} names of up to {max(map(len, header)):,} characters: give at most "
+            f"{MOST:,} of at most {LONGEST}"
+        )
     twice = [name for name, count in Counter(header).items() if count > 1]
     for name in header:
         if has_controls(name):
@@ -101,9 +107,9 @@ def _number(cell: str, where: str, name: str) -> float:
         value = float(cell) if cell else math.nan
     except ValueError:
         value = math.inf
-    if math.isinf(value):
+    if abs(value) > LARGEST_NUMBER:
         raise BadInput(
-            f"{where}: {name[:SHOWN]} is {cell[:SHOWN]!r}, which is no finite number: give one, or leave the "
-            "cell empty"
+            f"{where}: {name[:SHOWN]} is {cell[:SHOWN]!r}, which is no finite number up to "
+            f"{LARGEST_NUMBER:g}: give one, or leave the cell empty"
         )
     return value

@@ -65,6 +65,17 @@ def current_folder(name: str) -> Iterator[None]:
         del sys.path[last]  # not one of the user's own
 
 
+@contextmanager
+def only_installed() -> Iterator[None]:
+    """Lets nothing be found in the current folder, which a Python session and `python -m` search first."""
+    before = [*sys.path]
+    sys.path[:] = [f for i, f in enumerate(before) if f and (i or f != os.getcwd())]
+    try:
+        yield
+    finally:
+        sys.path[:] = [*before, *(folder for folder in sys.path if folder not in before)]
+
+
 def module_file(name: str) -> Path | None:
     """Returns the file of the top-level module of "package.module:Name"; nothing is imported to find it."""
     spec = _installed(name) or PathFinder.find_spec(_top(name), [""])

@@ -23,7 +23,7 @@ from gymnasium import spaces
 
 from hyrl_mj.errors import BadInput, brief, check_seed
 from hyrl_mj.files.artifacts import digest
-from hyrl_mj.files.trust import current_folder
+from hyrl_mj.files.trust import current_folder, only_installed
 from hyrl_mj.gym_import.observations import parts_of
 from hyrl_mj.physics import mjcf, mujoco_log
 from hyrl_mj.ranges import Integer, OneOf, Optional, refused
@@ -190,7 +190,7 @@ def register(name: str) -> None:
     for module in PACKAGES:
         try:
             # What a package prints is about environments that nobody has asked for.
-            with redirect_stderr(io.StringIO()):
+            with redirect_stderr(io.StringIO()), only_installed():
                 package = importlib.import_module(module)
         except ImportError:
             continue

@@ -22,6 +22,7 @@ from hyrl_mj.tasks import Outcome, Task
 
 # Episodes, also of attacks, that are simulated at once, which limits the memory.
 BATCH = 4_096
+MOST = 10**9  # episodes: days
 # Episodes that plain MuJoCo plays once more, spread over all kinds of noise and controllers; lost ones first.
 JUDGED = 500
 
@@ -99,6 +100,12 @@ class NoisyEpisodes:
     comparisons: tuple[Comparison, ...]
 
 
+def check_count(count: int) -> None:
+    """Raises `BadInput` if so many episodes cannot be simulated."""
+    if not 1 <= count <= MOST:
+        raise BadInput(f"{count} episodes cannot be simulated: give at least 1, at most {MOST:,}")
+
+
 def noisy_episodes(
     task: Task,
     regions: Regions,
@@ -128,8 +135,7 @@ def noisy_episodes(
     """
     check_seed(seed)
     check_points(task.chart, regions.points, task.name)
-    if count < 1:
-        raise BadInput(f"{count} episodes cannot be simulated: give at least 1")
+    check_count(count)
     for noise in noises:
         task.check_noise(noise.bound, noise.everywhere)
     near = max(noise.bound for noise in noises)  # all begin alike

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from hyrl_mj.errors import BadInput
+from hyrl_mj.errors import BadInput, check_seed
 from hyrl_mj.judging.attacks import Budget, attack, attack_starts, shown_arcs
-from hyrl_mj.judging.episodes import NoisyEpisodes, Regions, noisy_episodes
+from hyrl_mj.judging.episodes import NoisyEpisodes, Regions, check_count, noisy_episodes
 from hyrl_mj.judging.game import MapClass, Maps, Robustness, compare
 from hyrl_mj.judging.worst_case import worst_case
 from hyrl_mj.policies import Controller
@@ -138,8 +138,9 @@ def examine(
     count = options.episodes
     if count is None and not subject.exact:
         count = subject.effort.episodes
-    if count is not None and count < 1:
-        raise BadInput(f"{count} episodes cannot be simulated: give at least 1")
+    check_seed(options.seed)
+    if count is not None:
+        check_count(count)
     usual = [kind for kind in usual_kinds(task, eps) if not (everywhere and kind == SENSOR)]
     noises = [noise_of(task, kind, eps, everywhere) for kind in options.noise or usual]
     game, maps = None, None

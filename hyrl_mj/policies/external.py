@@ -97,6 +97,8 @@ class Agent:
 AnyPolicy = str | Path | Policy | PythonAgent
 # The statistics of `VecNormalize` in a run directory.
 STATISTICS = "vecnormalize.npz"
+# The ends of the names of files of agents, which are never the name of an object.
+FILES = (".zip", ".onnx", ".safetensors")
 # Kinds of agents besides those that SB3 trains.
 ONNX, FUNCTION = "onnx", "function"
 
@@ -133,13 +135,14 @@ class ExternalAgent:
 def agent_at(path: Path) -> AnyPolicy:
     """Returns the path of an agent's file itself, or the object that `module:object` names.
 
-    A module is imported if there is no such file, from the current folder where it is not installed.
+    A module is imported if there is no such file and the name is that of none, from the current folder where
+    it is not installed.
 
     Raises:
         BadArtifact: there is no such file.
         BadInput: there is no such module or object, or it can be no agent.
     """
-    if ":" not in str(path) or path.exists():
+    if ":" not in str(path) or path.suffix in FILES or path.exists():
         with artifacts.reading(path, REMEDY):
             path.stat()
         return path

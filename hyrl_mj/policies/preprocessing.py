@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hyrl_mj.errors import BadArtifact, BadInput
+from hyrl_mj.errors import LARGEST_NUMBER, BadArtifact, BadInput
 from hyrl_mj.files import archives, artifacts
 from hyrl_mj.policies import pickled
 from hyrl_mj.policies.mlp import MlpPolicy, ObservationPolicy, Policy, SampledPolicy
@@ -19,7 +19,6 @@ from hyrl_mj.policies.mlp import MlpPolicy, ObservationPolicy, Policy, SampledPo
 if TYPE_CHECKING:
     from hyrl_mj.tasks import Task
 
-LARGEST_NUMBER = 1e30  # of statistics: its square is a number, too
 NONE = "none"  # in place of a file of statistics: the agent saw plain observations
 RECIPE = "give what env.save() of VecNormalize wrote, or an npz file with mean, var and clip"
 

@@ -118,7 +118,8 @@ def column_noise(
     known = np.isfinite(y)
     if known.sum() < LEAST:
         return ColumnNoise(name, remarks=(f"{name} has fewer than {LEAST} numbers",))
-    tiny = 1e-9 * float(np.nanmax(np.abs(y)))  # more than the rounding of floats does
+    # More than the rounding of floats does.
+    tiny = max(1e-9 * float(np.nanmax(np.abs(y))), float(np.finfo(float).tiny))
     if np.ptp(y[known]) <= tiny:
         return ColumnNoise(name, remarks=(f"{name} never changes, so its noise cannot be told",))
     if r is not None:

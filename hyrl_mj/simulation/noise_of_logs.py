@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from hyrl_mj.errors import BadInput, counted, unknown
+from hyrl_mj.errors import LARGEST_NUMBER, BadInput, counted, unknown
 from hyrl_mj.files.logs import Log
 from hyrl_mj.simulation.column_noise import LEAST, LONGEST_DELAY, ColumnNoise, column_noise
 from hyrl_mj.simulation.noise import LOG, Noise, Sample, Signal
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from hyrl_mj.tasks import Task
 
 TIMES = ("t", "time")
+COLUMNS = 500  # that are looked at, each of which takes some 10 ms
 MOST = 20_000_000  # samples with gaps between them, which take 160 MB a column and step
 
 
@@ -159,10 +160,10 @@ def noise_from_log(
     factors = dict(scale or {})
     for name, factor in factors.items():
         number = isinstance(factor, int | float | np.number) and not isinstance(factor, bool)
-        if not number or not 0 < abs(factor) < np.inf:
+        if not number or not 0 < abs(factor) <= LARGEST_NUMBER:
             raise BadInput(f"{name} cannot be multiplied by {factor!r:.40}: give a factor as 0.001")
-    if dt is not None and not 0 < dt < np.inf:
-        raise BadInput(f"a time of {dt:g} s between rows cannot be used: give one > 0")
+    if dt is not None:
+        _check_step(dt)
     if not 0.5 <= share <= 1:
         raise BadInput(f"a share of {share:g} cannot be used: give one from 0.5 to 1, as 0.999")
     log = path if isinstance(path, Log) else Log(path)
@@ -224,6 +225,8 @@ def _chosen(
             raise unknown(f"measured column of {path}", name, measured)
     usual = [name for name in measured if at_rest or f"{name}_ref" in header]
     chosen = list(dict.fromkeys(columns or usual))
+    if len(chosen) > COLUMNS:
+        raise BadInput(f"{path} has {len(chosen):,} measured columns: choose at most {COLUMNS}")
     lacks = [name for name in chosen or measured if f"{name}_ref" not in header]
     if not measured or (lacks and not at_rest):
         name = lacks[0] if lacks else "x"
@@ -250,7 +253,7 @@ def _clock(
     if not (steps > 0).all():
         line = int(np.argmin(steps > 0)) + 3  # the names are line 1
         raise BadInput(f"{path}, line {line}: the time does not increase, so sort the rows by it")
-    step, remarks = float(np.median(steps)), []
+    step, remarks = _check_step(float(np.median(steps))), []
     samples = np.rint(steps / step)
     if gaps := int((samples > 1).sum()):
         remarks.append(
@@ -265,6 +268,15 @@ def _clock(
     # A gap only has to be longer than any delay.
     apart = np.clip(samples, 1, LONGEST_DELAY + 1).astype(int)
     return t, np.concatenate([[0], np.cumsum(apart)]), step, remarks
+
+
+def _check_step(dt: float) -> float:
+    """Returns the time between two rows [s], or raises `BadInput` if no log has it."""
+    if not 1e-9 <= dt <= 1e9:
+        raise BadInput(
+            f"a time of {dt:g} s between rows cannot be used: give one > 0, of 1e-9 to 1e9 s"
+        )
+    return dt
 
 
 # What a text can name.

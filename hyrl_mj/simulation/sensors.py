@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 
-from hyrl_mj.errors import BadInput, check_bound, unknown
+from hyrl_mj.errors import LARGEST_NUMBER, BadInput, check_bound, unknown
 from hyrl_mj.simulation.checked_noise import drawn
 from hyrl_mj.simulation.noise import (
     DELAY,
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 
 # Bounds are rounded up to parts of so many, but for the rounding of sums of floats, which is far below that.
 DECIMALS, ROUNDING = 1e9, 1e-3
+MOST = 20  # parts of a sensor: each takes its time at every sample
 
 
 @register_noise
@@ -148,6 +149,12 @@ class Part:
         for name, x in options.items():
             if name in ("sigma", "rate") and not (math.isfinite(x) and x > 0):
                 raise BadInput(f"{self}: give a {name} > 0")
+        if any(
+            x and not 1 / LARGEST_NUMBER <= x <= LARGEST_NUMBER for x in (value, *options.values())
+        ):
+            raise BadInput(
+                f"{self}: give numbers from {1 / LARGEST_NUMBER:g} to {LARGEST_NUMBER:g}, or 0"
+            )
 
     def __str__(self) -> str:
         value, options = f"{self.value:.12g}", dict(self.options)
@@ -243,7 +250,10 @@ class Sensor:
             raise BadInput(
                 f"the sensor {text!r:.60} is no text: give one as 'uniform 0.05 + delay 1'"
             )
-        return Sensor(tuple(map(Part.parse, re.split(r"\+(?!\d)", text))))  # not that of 1e+3
+        parts = re.split(r"\+(?!\d)", text)  # not that of 1e+3
+        if len(parts) > MOST:
+            raise BadInput(f"the sensor {text!r:.60} has {len(parts):,} parts: give at most {MOST}")
+        return Sensor(tuple(map(Part.parse, parts)))
 
     def __post_init__(self) -> None:
         for word in (DELAY, HOLD, QUANTUM):

@@ -31,6 +31,10 @@ _BREAKS = re.compile("([\\n\\r\\t])")
 _SEQUENCES = re.compile("([\\n\\r\\t]|\\x1b\\[(?:[0-9;]*[mABCDGK]|\\?25[hl]))")
 
 
+# Errors of the system that a path brings about which somebody gives.
+_NAMES = (errno.ENAMETOOLONG, errno.EACCES, errno.EPERM, errno.ELOOP, errno.ENOTDIR, errno.EISDIR)
+
+
 class _Raw(io.FileIO):
     """A stream that swallows everything after the first write that fails, whose error it keeps."""
 
@@ -131,16 +135,15 @@ class Streams:
         except HyrlError as error:
             self._complain(str(error))
             return error.exit_status
-        except OSError as error:
-            where = "" if error.filename is None else f": {os.fsdecode(error.filename)}"
-            self._complain(f"{error.strerror or brief(error)}{where}")
-            return 1
         except KeyboardInterrupt:
             self._complain(INTERRUPTED)
             return 128 + signal.SIGINT
         except SystemExit as error:
             return error.code if isinstance(error.code, int) else int(error.code is not None)
         except Exception as error:
+            if (said := _of_system(error)) is not None:
+                self._complain(str(said))
+                return said.exit_status
             if self._is_deaf:  # the traceback would not be seen
                 self._complain(brief(error))
             raise
@@ -199,6 +202,23 @@ class Streams:
 
     def _problem(self, number: int) -> OSError | None:
         return self._raw[number].problem if number in self._raw else None
+
+
+def _of_system(error: Exception) -> HyrlError | None:
+    """Returns the sentence for an error of the system, None for a mistake in the code."""
+    if isinstance(error, MemoryError):
+        return HyrlError(
+            "there is not enough memory: let other programs end, or give it less to do"
+        )
+    if isinstance(error, RuntimeError) and str(error).startswith(
+        "Symlink loop"
+    ):  # before Python 3.13
+        return BadInput(f"{error}: give another path")
+    if not isinstance(error, OSError):
+        return None
+    where = "" if error.filename is None else f": {os.fsdecode(error.filename)}"
+    kind = BadInput if error.errno in _NAMES else HyrlError
+    return kind(f"{error.strerror or brief(error)}{where}")
 
 
 def check_working_directory() -> None:

@@ -133,7 +133,8 @@ def described_task(name: str) -> Task:
 
 def _offered() -> dict[str, EntryPoint]:
     """Returns the tasks that installed packages offer, as hyrl_mj.tasks: name = "its.module:Class"."""
-    return {entry.name: entry for entry in entry_points(group="hyrl_mj.tasks")}
+    with trust.only_installed():
+        return {entry.name: entry for entry in entry_points(group="hyrl_mj.tasks")}
 
 
 def _instance(kind: type[Task], what: str) -> Task:

@@ -35,7 +35,7 @@ def write_task(name: str, folder: Path) -> list[Path]:
         for path in sorted(TEMPLATES.iterdir())
         if path.is_file()
     }
-    if existing := [path for path in texts if path.exists()]:
+    if existing := [path for path in texts if path.exists() or path.is_symlink()]:
         raise BadInput(f"{existing[0]} exists already: choose another name, or another folder")
     for path, text in texts.items():
         with artifacts.replacing(path) as temporary:
