@@ -637,7 +637,7 @@ def test_what_changes_from_episode_to_episode_is_refused(make, message):
 def test_statistics_that_are_loaded_are_kept_and_a_count_is_said():
     from_gymnasium(lambda: normalised(True))
     task = from_gymnasium(type("Counting", (Weakening,), {"weakens": False}))
-    assert "because episodes outlasts resets" in task.found["episodes"]
+    assert "because of what outlasts resets (episodes)" in task.found["episodes"]
 
 
 # ---- generators of their own

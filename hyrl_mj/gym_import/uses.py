@@ -169,8 +169,9 @@ def check_episodes(spec: EnvironmentSpec) -> None:
         names |= dict.fromkeys(_outlasting(spec, old, rng))
     if names:
         spec.found["episodes"] = (
-            f"each is played by a new environment, because {', '.join([*names][:4])} outlasts resets; no "
-            f"trial of {3 + 2 * EPISODES} episodes shows that what comes next depends on it"
+            "each is played by a new environment, because of what outlasts resets "
+            f"({', '.join([*names][:4])}); no trial of {3 + 2 * EPISODES} episodes shows that what comes "
+            "next depends on it"
         )
 
 
