@@ -99,9 +99,16 @@ def arrivals(run: Run, arcs: Arcs, policy: bool) -> tuple[int, int]:
 
 
 def replay_sentence(run: Run, arcs: Arcs) -> str:
-    """Returns from how many of the scene's starts the hybrid controller reaches the set-point."""
-    reached, total = arrivals(run, arcs, policy=False)
-    return f"HyRL reaches the set-point from {reached} of {total} of the scene's starts"
+    """Returns from how many of the scene's starts the hybrid controller reaches the set-point.
+
+    Runs of the scene may last longer than episodes.
+    """
+    (reached, total), task = arrivals(run, arcs, policy=False), run.task
+    found = f"HyRL reaches the set-point from {reached} of {total} of the scene's starts"
+    longest = task.max_steps * task.dt
+    if task.scene.time <= longest + task.dt / 2:
+        return found
+    return f"{found} within {task.scene.time:g} s; an episode lasts {longest:g} s"
 
 
 # ---- robustness
