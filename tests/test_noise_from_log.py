@@ -354,6 +354,9 @@ def test_angles_that_jump_by_a_turn_are_no_noise(tmp_path):
     path = write(tmp_path / "log.csv", log)
     with pytest.raises(BadInput, match="give --turn x"):
         noise_from_log(path)
+    exact = log | {"x": (true + 0.5 + np.pi) % (2 * np.pi) - np.pi}
+    with pytest.raises(BadInput, match="give --turn x"):
+        noise_from_log(write(tmp_path / "exact.csv", exact))
     (column,) = noise_from_log(path, turn=["x"]).columns
     assert column.bound == pytest.approx(0.1, rel=0.1)
     moved = planted(0, 0.05, uniform=4.0)  # [m]
@@ -368,6 +371,13 @@ def test_a_factor_is_a_number(factor, tmp_path):
         noise_from_log(
             write(tmp_path / "log.csv", planted(0, 0.05, uniform=0.1)), scale={"x": factor}
         )
+
+
+@pytest.mark.parametrize("off", [5.0, 20.0, 100.0])
+def test_an_outlier_is_no_turn(off, of):
+    log = planted(0, 0.05, uniform=0.1)
+    log["x"][3_000] += off
+    assert of(log).bound == pytest.approx(0.1, rel=0.1)
 
 
 def test_a_constant_error_is_a_bias_and_no_turn(of):
