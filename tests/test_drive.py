@@ -141,6 +141,7 @@ BAD = {
     "no radius": (with_post(positions_m=[[0, 0]]), ["posts[0] has no radius_m"]),
     "no heading": (with_start(position_m=[0, 0]), ["starts[0] has no heading_rad"]),
     "radius 0": (with_post(radius_m=0, positions_m=[[0, 0]]), ["radius_m is 0", "> 0"]),
+    "radius 1e-300": (with_post(radius_m=1e-300, positions_m=[[0, 0]]), ["is 1e-300", "at least"]),
     "radius -1": (with_post(radius_m=-1, positions_m=[[0, 0]]), ["radius_m is -1", "> 0"]),
     "radius true": (with_post(radius_m=True, positions_m=[[0, 0]]), ["radius_m is true"]),
     "radius text": (with_post(radius_m="0.5", positions_m=[[0, 0]]), ['radius_m is "0.5"']),

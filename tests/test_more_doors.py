@@ -390,7 +390,7 @@ def test_what_is_divided_by_is_not_tiny(name, tmp_path):
         "starts": [{"position_m": [-5, 0], "heading_rad": 0}],
     }
     (tmp_path / "tiny.json").write_text(json.dumps(field | {name: 1e-320}))
-    with pytest.raises(BadInput, match="> 0, from 1e-09 to 3600 s"):
+    with pytest.raises(BadInput, match="> 0, at least 1e-09 and at most 3600 s"):
         read_field(tmp_path / "tiny.json")
 
 

@@ -185,7 +185,11 @@ class _Part:
         is_number = isinstance(self.value, int | float) and not isinstance(self.value, bool)
         if is_number and -most <= self.value <= most and not (positive and self.value < LEAST):
             return float(self.value)
-        limits = f"> 0, from {LEAST:g} to {most:g}" if positive else f"from {-most:g} to {most:g}"
+        limits = (
+            f"> 0, at least {LEAST:g} and at most {most:g}"
+            if positive
+            else f"from {-most:g} to {most:g}"
+        )
         raise self._refused(f"a number {limits} {unit}")
 
     def _refused(self, meaning: str) -> BadInput:
