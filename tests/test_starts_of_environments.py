@@ -276,6 +276,8 @@ class Later(At):
 def test_a_wrapper_that_moves_the_robot_to_its_own_start_is_refused():
     with pytest.raises(BadInput, match=r"wrapper of lambda moves the robot in its reset\(\)"):
         from_gymnasium(lambda: Moving(At()), steps=20, pinned={"qvel[0]": 0.0})
+    with pytest.raises(BadInput, match="let no wrapper move the robot in its reset"):
+        from_gymnasium(lambda: Moving(At()), steps=20)
 
 
 def test_a_chart_is_no_state_where_the_time_matters_late():

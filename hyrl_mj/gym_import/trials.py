@@ -28,18 +28,24 @@ PLACES, AWAY, FAR = 64, 2, 5
 def observer_of(instance: Instance) -> str:
     """Returns the name of what computes what an environment observes; raises `BadInput` if nothing does."""
     rng, space = np.random.default_rng(0), instance.inner.observation_space
-    left = observers(instance.env)
+    at_reset = later = observers(instance.env)
 
-    def agreeing() -> dict[str, Any]:
+    def agreeing(names: dict[str, Any]) -> dict[str, Any]:
         seen = flat(instance.inner_seen, space)
-        return {name: get for name, get in left.items() if _agrees(get, seen, space)}
+        return {name: get for name, get in names.items() if _agrees(get, seen, space)}
 
     for seed in range(EPISODES):
         instance.reset(seed)
         if not instance.spec.description.pinned:  # else it was pinned after that observation
-            left = agreeing()
+            at_reset = agreeing(at_reset)
         for _ in instance.wander(rng, SAMPLES, HELD):
-            left = agreeing()
+            later = agreeing(later)
+    left = {name: get for name, get in later.items() if name in at_reset}
+    if later and not left:
+        raise BadInput(
+            f"reset() of {instance.name} returns what is not observed in the state that it leads to: let it "
+            "call mj_forward before it observes, and let no wrapper move the robot in its reset()"
+        )
     if not left:
         raise BadInput(
             f"{instance.name} has no method that computes what it observes in its present state, so nothing "
