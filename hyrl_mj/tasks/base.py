@@ -443,7 +443,7 @@ class Task(ABC):
         if bound >= limits.min():
             raise BadInput(
                 f"noise bound {bound:g} hides the whole state space of {self.name}: "
-                f"give one below {limits.min():.3g} {self.chart.units[int(limits.argmin())]}"
+                f"give an eps below {limits.min():.3g} {self.chart.units[int(limits.argmin())]}"
             )
         return float(bound)
 
