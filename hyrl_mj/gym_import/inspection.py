@@ -35,8 +35,9 @@ from hyrl_mj.gym_import.opening import (
     made,
 )
 from hyrl_mj.gym_import.pool import Pool
+from hyrl_mj.gym_import.resets import resets_of
 from hyrl_mj.gym_import.specification import Criterion
-from hyrl_mj.gym_import.starts import check_noted, resets_of
+from hyrl_mj.gym_import.starts import check_noted
 from hyrl_mj.gym_import.uses import (
     changes_by_reset,
     check_episodes,
