@@ -26,8 +26,8 @@ from hyrl_mj.gym_import.fingerprint import codes_of, differing, is_known
 from hyrl_mj.gym_import.instance import Instance
 from hyrl_mj.gym_import.observations import parts_of
 from hyrl_mj.gym_import.opening import (
+    COUNTING,
     FORMS,
-    PEELED,
     AnyChart,
     Description,
     actions_of,
@@ -286,7 +286,7 @@ def _criterion(instance: Instance, info: Sequence[str]) -> Criterion:
         if path[0] not in info and not _is_written(instance.env, path[0]):
             met = f"it has had {', '.join(info)}" if info else "it has been empty"
             names = [type(layer).__name__ for layer in layers(made(description))]
-            if counting := [one for one in names if one in PEELED[-2:]]:
+            if counting := [one for one in names if one in COUNTING]:
                 met += f"; runs are played without {counting[0]}, so say it by reward or terminated"
             raise BadInput(
                 f"no sampled run of {name} had {path[0]!r} in its info, and no method of it has that word: "

@@ -30,10 +30,9 @@ from hyrl_mj.ranges import Integer, OneOf, Optional, refused
 
 # Packages that offer environments, with the extra that brings each.
 PACKAGES = {"gymnasium_robotics": "robotics", "ogbench": "robotics", "shimmy": "dm-control"}
-# Wrappers that count or check, and change nothing of what an environment does.
-PEELED = (
-    "TimeLimit", "OrderEnforcing", "PassiveEnvChecker", "Autoreset", "RecordEpisodeStatistics", "Monitor",
-)  # fmt: skip
+# Wrappers that count or check, and change nothing of what an environment does; the first write to `info`.
+COUNTING = ("RecordEpisodeStatistics", "Monitor")
+PEELED = (*COUNTING, "TimeLimit", "OrderEnforcing", "PassiveEnvChecker", "Autoreset")
 # Conditions, as messages name them.
 FORMS = '"terminated and reward >= 1", \'info["solved"]\' or "distance(fingertip, target) <= 0.05"'
 # Chart, as users give it: one name, several, or new names with the names of what they stand for.
