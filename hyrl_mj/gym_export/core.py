@@ -201,8 +201,8 @@ class BatchedEnv:
         """Returns noisy measurements (k, p) of the rows `ids`, which `measured` holds from then on."""
         true, modes = self.plant.truth(ids), np.full(len(ids), NOT_STARTED)
         noise = drawn(self._noise, Sample(ids, self.samples[ids], true, modes, self.plant))
-        self.measured[ids] = self.plant.observe(true, noise, ids)
-        return self.measured[ids]
+        self.measured[ids] = measured = self.plant.observe(true, noise, ids)
+        return measured
 
 
 def cautious_reward(

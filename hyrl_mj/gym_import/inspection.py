@@ -48,8 +48,9 @@ from hyrl_mj.gym_import.uses import (
 from hyrl_mj.physics import mjcf
 from hyrl_mj.sets import Chart
 
-# Resets and steps of an inspection, about, and from how long on it is said how long it takes [s].
-TAKEN, LONG = (530, 12_000), 60.0
+# Resets and steps of an inspection, about (without wrappers half as many resets), and from how long on it is
+# said how long it takes [s].
+TAKEN, LONG = (750, 12_000), 60.0
 # What is said of an observation that shows derived quantities from before the end of a step.
 LAG = {
     "earlier": "is that of a physics step before the end of a step, with noise, too",

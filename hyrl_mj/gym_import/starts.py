@@ -370,7 +370,7 @@ def _homes(instance: Instance) -> list[np.ndarray]:
     nq = instance.model.nq
     arrays = (a for a in values if isinstance(a, np.ndarray) and a.shape == (nq,))
     homes = [a for a in arrays if a.dtype.kind == "f" and a.flags.writeable]
-    return [*homes, instance.model.key_qpos][: len(homes) + min(instance.model.nkey, 1)]
+    return [*homes, instance.model.key_qpos] if instance.model.nkey else homes
 
 
 def _check_natural(spec: EnvironmentSpec, resets: Resets) -> None:

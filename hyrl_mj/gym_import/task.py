@@ -230,9 +230,9 @@ class EnvironmentTask(Task):
         d = self.chart.dimension
         changed, found = np.flatnonzero((measured[:, :d] != z).any(axis=1)), measured.copy()
         if len(changed):
-            at_rest, z_now = self.specification.at_rest, z[changed]
-            known = at_rest is not None
-            seen = self.specification.terms(z_now) @ at_rest if known else self._begun(z_now)[0]
+            spec, z_now = self.specification, z[changed]
+            fitted = spec.at_rest is not None
+            seen = spec.terms(z_now) @ spec.at_rest if fitted else self._begun(z_now)[0]
             moves = d + np.flatnonzero(self.specification.moves)
             found[changed[:, None], moves] = seen[:, self.specification.moves]
             found[changed, :d] = z_now

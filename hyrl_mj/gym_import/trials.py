@@ -20,8 +20,7 @@ from hyrl_mj.gym_import.stage import Played
 # Episodes and samples of a trial, and for how many samples inputs are held.
 EPISODES, SAMPLES, HELD = 8, 40, 8
 # Places on the chart from which runs of so many samples come to one state, which may show where they were;
-# from the first places whole episodes, in which slow sensors measure. Where a sum of terms is fitted to what
-# is observed at rest, so many places for each term.
+# from the first places whole episodes, in which slow sensors measure.
 PLACES, AWAY, FAR = 64, 2, 5
 
 
@@ -213,7 +212,9 @@ def derived_of(instance: Instance) -> tuple[Derived, list[int]]:
 def moving(pool: Pool) -> tuple[np.ndarray, np.ndarray | None]:
     """Returns which columns of an observation at rest follow the chart (o,) bool, and `at_rest` of a spec."""
     spec, rng = pool.spec, np.random.default_rng(0)
-    z = spec.anywhere(rng, PLACES * spec.terms(spec.anywhere(rng, 1)).shape[1])
+    # For each term; with wrappers each of them takes two resets.
+    places = EPISODES if spec.wrapped else PLACES
+    z = spec.anywhere(rng, places * spec.terms(spec.anywhere(rng, 1)).shape[1])
     seen, depths = pool.scatter("rest", spec.state_at(z))
     check_finite(spec.name, seen[depths <= spec.depth])
     fit = np.linalg.lstsq(terms := spec.terms(z), seen, rcond=None)[0]
