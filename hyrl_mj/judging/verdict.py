@@ -363,6 +363,15 @@ class _Case:
                 yield (
                     f"{when} HyRL {share_sentence(ours)} of {self.whole}, the policy {share_sentence(theirs)}"
                 )
+        if sensed := self.robustness.deciding.sensed:
+            names = {"hyrl": "HyRL", "policy": "the policy"}
+            each = [
+                f"{names[who]} from {percent(sensed[who].proved)}" for who in names if who in sensed
+            ]
+            yield (
+                "the sensor can do less than all noise within that bound: under the sensor itself are proved "
+                f"{' and '.join(each)} of all starts"
+            )
         for count in self.robustness.deciding.replays:
             yield replays_sentence(self.task, count)
         yield from self._attacked("hyrl", "policy")

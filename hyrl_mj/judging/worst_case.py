@@ -23,6 +23,7 @@ from hyrl_mj.judging.game import (
     Profile,
     ReplayCount,
     Score,
+    SensedScore,
     WinningShares,
     curve_grid,
     lattice_grid,
@@ -32,9 +33,10 @@ from hyrl_mj.judging.proof.cells import why_no_cells
 from hyrl_mj.judging.proof.certificate import Certificate, Proved
 from hyrl_mj.judging.proof.counterexamples import Broken, find_counterexamples
 from hyrl_mj.judging.proof.replays import replay
+from hyrl_mj.judging.proof.sensed import prove_under
 from hyrl_mj.policies import BLAS, Controller
 from hyrl_mj.sets import GridSet
-from hyrl_mj.simulation import LoopSettings, closed_loop
+from hyrl_mj.simulation import LoopSettings, Sensor, closed_loop, covers_sensor
 from hyrl_mj.system import cores
 from hyrl_mj.system.progress import progress_bar
 from hyrl_mj.tasks import Task
@@ -78,9 +80,12 @@ def worst_case(
     if not exact:  # a coarser lattice would estimate nothing
         coarse, margins = fine, dict.fromkeys(controllers)
         curve, profile = _known(bounds, scores), Profile((), dict.fromkeys(names, ()))
+        sensed = {}
     else:
         coarse = Game(task, parts, controllers, LARGEST, everywhere, curve_grid(task, cells))
-        curve, profile = _sweep(Certificate.certify(coarse, controllers), names, points)
+        of_coarse = Certificate.certify(coarse, controllers)
+        curve, profile = _sweep(of_coarse, names, points)
+        sensed = _sensed(task, bounds[-1], (certificate, of_coarse))
         likely = [(name, _last_won(curve, curve.wins[name])) for name in controllers]
         margins = dict(zip(controllers, _in_threads("margins", fine.margin, likely), strict=True))
     spacing, curve_spacing = (tuple(g.lattice.grid.spacing.tolist()) for g in (fine, coarse))
@@ -91,7 +96,7 @@ def worst_case(
     misses = _misses(coarse, controllers)
     result = GameResult(
         everywhere, lattice, scores, margins, proved, dict(certificate.why_not), misses, curve, profile,
-        replays,
+        replays, sensed,
     )  # fmt: skip
     return result, maps
 
@@ -120,6 +125,21 @@ def _scores(
     classes = {name: _map(certificate, name, bounds[-1]) for name in controllers}
     maps = Maps(bounds[-1], np.array(game.lattice.grid.counts), classes)
     return scores, maps
+
+
+def _sensed(
+    task: Task, eps: float, certificates: tuple[Certificate, ...]
+) -> dict[str, SensedScore]:
+    """Returns what is proved under the task's own sensor, on the first lattice that is coarse enough."""
+    if not covers_sensor(task, eps):
+        return {}
+    sensor = Sensor.parse(task.sensor)
+    if not (sensor.late or sensor.bounds(task)[1].any()):  # all of it is noise, drawn anew
+        return {}
+    for certificate in certificates:
+        if certificate.game.largest >= eps and (found := prove_under(certificate, sensor, eps)):
+            return found
+    return {}
 
 
 def _replays(

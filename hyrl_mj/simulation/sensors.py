@@ -275,13 +275,33 @@ class Sensor:
         return sum(noises) + self.part(QUANTUM).value / 2
 
     @property
+    def delays(self) -> tuple[int, int]:
+        """The shortest and the longest delay of an episode [samples]."""
+        delay = self.part(DELAY)
+        return int(delay.options.get("least", delay.value)), int(delay.value)
+
+    @property
+    def held(self) -> int:
+        """How many samples are held in a row, at most."""
+        return int(self.part(HOLD).value)
+
+    @property
     def late(self) -> int:
         """How many samples old a measurement can be."""
-        return int(self.part(DELAY).value + self.part(HOLD).value)
+        return self.delays[1] + self.held
 
     def part(self, word: str) -> Part:
         """Returns the part of a word, or `NOTHING`."""
         return next((part for part in self.parts if part.word == word), NOTHING)
+
+    def bounds(self, task: Task) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the bounds of what is added to the chart's coordinates at a sample, but for the bias (d,).
+
+        Then those of the bias (d,), which stays during an episode.
+        """
+        shares = np.abs(self._shares(task))[: task.chart.dimension]
+        bias = sum(part.value for part in self.parts if part.word == Bias.kind)
+        return (self.bound - bias) * shares, bias * shares
 
     def reach(self, task: Task) -> np.ndarray:
         """Returns how far off each column of a measurement can be: (p,), in its unit.
@@ -380,9 +400,8 @@ class Sensed(Signal):
             if part.is_noise
         ]
         self._quantum = sensor.part(QUANTUM).value * np.abs(shares)
-        delay, hold = sensor.part(DELAY), sensor.part(HOLD)
-        self._delays = int(delay.options.get("least", delay.value)), int(delay.value)
-        self._most, self._rate = int(hold.value), hold.options.get("rate", 0.5)
+        self._delays, self._most = sensor.delays, sensor.held
+        self._rate = sensor.part(HOLD).options.get("rate", 0.5)
         self._late, added = sensor.late, not (sensor.late or self._quantum.any())
         self.unseeing = added and all(noise.unseeing for noise in self.noises)
         return self

@@ -167,6 +167,19 @@ def margin_table(task: Task, game: GameResult) -> Table:
     return Table.of(f"{task.name}: margins", rows)
 
 
+def sensed_table(task: Task, game: GameResult) -> Table:
+    """Returns what is proved under the task's own sensor: a row for each controller."""
+    rows = [
+        {
+            "controller": NAMES[who],
+            "proved, own q0": percent(score.proved),
+            "proved, any q0": percent(score.proved_any),
+        }
+        for who, score in game.sensed.items()
+    ]
+    return Table.of(f"{task.name}: of all starts, under its sensor: {task.sensor}", rows)
+
+
 def excursion_text(excursion: float | None) -> str:
     """Returns how far off the set-point noise keeps a run; "-" where every run ends."""
     return "-" if excursion is None else f"{excursion:.3f}"
@@ -307,7 +320,11 @@ def robustness_sentence(robustness: Robustness) -> str:
         f"{NAMES[count.controller]} lost {count.failures:,} of {count.played:,} replays"
         for count in robustness.deciding.replays
     ]
-    return f"worst case at noise {hyrl.eps:g}, of the winnable starts: {', '.join(shares)}"
+    found = f"worst case at noise {hyrl.eps:g}, of the winnable starts: {', '.join(shares)}"
+    if sensed := robustness.deciding.sensed:
+        proved_of = (f"{NAMES[who]} {percent(s.proved)} proved" for who, s in sensed.items())
+        found += f"; under the sensor itself, of all starts: {', '.join(proved_of)}"
+    return found
 
 
 # ---- logs

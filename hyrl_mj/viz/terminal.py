@@ -17,6 +17,7 @@ from hyrl_mj.viz.tables import (
     replay_table,
     replays_table,
     score_table,
+    sensed_table,
     signals_table,
 )
 
@@ -51,6 +52,8 @@ def print_robustness(run: Run) -> None:
         print_table(score_table(run.task, game))
         if not game.estimate:
             print_table(margin_table(run.task, game))
+        if game.sensed:
+            print_table(sensed_table(run.task, game))
         if game.replays:
             print_table(replays_table(run.task, game.replays))
         for who, why in game.why_not_proved.items():

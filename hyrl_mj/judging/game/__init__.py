@@ -37,6 +37,7 @@ from hyrl_mj.judging.game.result import (
     Profile,
     Robustness,
     Score,
+    SensedScore,
     WinningShares,
     percent,
 )
@@ -86,6 +87,7 @@ __all__ = [
     "ReplayCount",
     "Robustness",
     "Score",
+    "SensedScore",
     "WinningShares",
     "aligned_cells",
     "compare",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 from pathlib import Path
 from typing import ClassVar
@@ -114,6 +114,20 @@ class Score(NodeScore):
 
 
 @dataclass(frozen=True)
+class SensedScore:
+    """What is proved of a controller under the task's own sensor, which remembers.
+
+    Attributes:
+        proved: share of all starts from which it wins if it picks its start mode, from every state of their
+            cells and whatever the sensor does.
+        proved_any: share from which it wins so from every start mode.
+    """
+
+    proved: float
+    proved_any: float
+
+
+@dataclass(frozen=True)
 class WinningShares:
     """What a controller wins at each noise bound of a curve.
 
@@ -197,6 +211,8 @@ class GameResult:
         profile: the noise that can be borne along M*.
         replays: the replays of what is proved or won at the largest noise bound, at most one for each
             controller; none of an estimate.
+        sensed: what is proved of each controller under the task's own sensor, if that has a bias, or is late,
+            and its game is not too large.
     """
 
     everywhere: bool
@@ -209,6 +225,7 @@ class GameResult:
     curve: Curve
     profile: Profile
     replays: tuple[ReplayCount, ...] = ()
+    sensed: dict[str, SensedScore] = field(default_factory=dict)
 
     @property
     def estimate(self) -> bool:
@@ -226,7 +243,7 @@ class GameResult:
         replayed = [count.controller for count in self.replays if count.is_whole]
         if len(replayed) < len(self.replays) or not {*replayed} <= examined:
             return False
-        if len({*replayed}) < len(replayed):
+        if len({*replayed}) < len(replayed) or not {*self.sensed} <= examined:
             return False
         whole = (self.margin, self.proved_margin, self.miss_without_noise)
         if any(set(table) != examined for table in whole) or not {*self.why_not_proved} <= examined:

@@ -125,8 +125,18 @@ class Boxes:
         slack = steep + 1e-12
         return least - slack, greatest + slack
 
-    def reachable(self, mask: np.ndarray, bound: np.ndarray) -> np.ndarray:
-        """Returns the cells (N,) bool from which noise within bounds (d,) can show a box of a mask (M...)."""
+    def reachable(
+        self, mask: np.ndarray, bound: np.ndarray, centre: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Returns the cells (N,) bool from which noise can show a box of a mask (M...).
+
+        The noise is within bounds (d,) around `centre` (d,), by default 0.
+        """
+        if centre is not None:
+            by = np.round(centre / self.step).astype(int)
+            # No farther than the boxes reach beyond the chart, so what comes around again is not looked at.
+            mask = np.roll(mask, -by, range(mask.ndim))
+            bound = bound + np.abs(centre - by * self.step)
         reach = np.ceil(bound / self.step - TINY).astype(int)
         mask = within_reach(mask, reach, self.cells.lattice.grid.chart.periodic)
         for axis, (n, fine) in enumerate(zip(self.cells.counts, self.fine, strict=True)):
@@ -222,11 +232,16 @@ class BoundedAnswers:
         shifts = tuple(tuple(_shifts(boxes, policy)) for policy in bounded)
         return BoundedAnswers(boxes, controller.modes, goes, shifts)
 
-    def possible(self, bound: np.ndarray) -> Iterator[Iterator[tuple[int, np.ndarray, np.ndarray]]]:
-        """Yields for each row what noise within bounds (d,) can lead to: number of the mode, shift, cells."""
+    def possible(
+        self, bound: np.ndarray, centre: np.ndarray | None = None
+    ) -> Iterator[Iterator[tuple[int, np.ndarray, np.ndarray]]]:
+        """Yields for each row what noise can lead to: number of the mode, shift, cells.
+
+        The noise is within bounds (d,) around `centre` (d,), by default 0.
+        """
         for goes in self.goes:
             yield (
-                (mode, shift, self.boxes.reachable(goes[mode] & chosen, bound))
+                (mode, shift, self.boxes.reachable(goes[mode] & chosen, bound, centre))
                 for mode, shifts in enumerate(self.shifts)
                 for shift, chosen in shifts
                 if (goes[mode] & chosen).any()

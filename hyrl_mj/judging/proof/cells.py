@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -13,7 +13,8 @@ from hyrl_mj.judging.proof.affine import Affine, Unbounded
 from hyrl_mj.judging.proof.assumptions import check_assumptions
 from hyrl_mj.judging.proof.networks import bounds_of, method_of, program_of
 from hyrl_mj.judging.proof.rules import as_form
-from hyrl_mj.sets import Grid
+from hyrl_mj.sets import Grid, within_reach
+from hyrl_mj.simulation import Sensor
 from hyrl_mj.tasks import Outcome, Task
 
 # Samples whose ends lie this close to the border of a cell, in cells after a whole episode, end on it.
@@ -97,7 +98,9 @@ class Cells(Places):
         )
         slack = np.maximum(slack, np.where(periodic, ROUNDING * far, 0.0))
         counts = np.array(grid.counts) - ~periodic
-        reach = np.ceil(np.abs(cells).max(axis=0) + 1).astype(int)
+        # What lies beyond the chart is known as far as a sample leads, and a bias shows the robot.
+        bias = Sensor.parse(task.sensor).bounds(task)[1] / h if task.sensor else 0.0
+        reach = np.ceil(np.abs(cells).max(axis=0) + 1 + bias).astype(int)
         margin = np.where(periodic, 0, reach)
         axes = [np.arange(-m, n + m) for m, n in zip(margin, counts, strict=True)]
         index = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
@@ -131,6 +134,33 @@ class Cells(Places):
             margin=margin,
         )
 
+    def widened(self, by: np.ndarray) -> Cells:
+        """Returns cells that end a run as they do where a robot is anywhere within `by` (d,) of them."""
+        n = self.nodes
+        inside, arrives = self.outside < n, self.outside == n
+        arrived = self._throughout(self.arrived, arrives, by)
+        goes_on = self._throughout(~self.failed, arrives, by)[inside]
+        return replace(
+            self,
+            arrived=arrived[inside],
+            failed=~goes_on,
+            running=goes_on & ~arrived[inside],
+            success=self._throughout(self.success, arrives, by)[inside],
+            outside=np.where(inside, self.outside, np.where(arrived, n, n + 1)),
+        )
+
+    def within(self, mask: np.ndarray, by: np.ndarray) -> np.ndarray:
+        """Returns the cells (N,) bool of which all that lies within `by` (d,) is in cells of a mask."""
+        inside = self.outside < self.nodes
+        return self._throughout(mask, np.zeros_like(inside), by)[inside]
+
+    def _throughout(self, mask: np.ndarray, beyond: np.ndarray, by: np.ndarray) -> np.ndarray:
+        """Returns where all that lies within `by` (d,) is of a mask (N,) bool, or is `beyond` the chart."""
+        whole, grid = beyond.copy(), self.lattice.grid
+        whole[self.outside < self.nodes] = mask
+        reach = np.ceil(by / grid.spacing - TINY).astype(int)
+        return ~within_reach(~whole, reach, grid.chart.periodic)
+
     def shifts(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns the first and last cell (..., d) that a cell can move onto, relative to itself.
 
@@ -154,6 +184,15 @@ class Cells(Places):
             at = np.arange(n) + by
             axes.append(at % n if periodic else at + margin)
         return np.asarray(self.outside[np.ix_(*axes)].ravel())
+
+    def shifted(self, by: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the cells (k, N) at shifts (k, d) by whole cells, and whether these exist: (k, N)."""
+        periodic, counts = self.lattice.grid.chart.periodic, np.array(self.counts)
+        at = np.stack(np.unravel_index(np.arange(self.nodes), self.counts), axis=-1) + by[:, None]
+        at = np.where(periodic, at % counts, at)
+        inside = np.clip(at, 0, counts - 1)
+        found = np.ravel_multi_index(tuple(np.moveaxis(inside, -1, 0)), self.counts)
+        return np.asarray(found), (at == inside).all(axis=-1)
 
     def all_corners(self, nodes: np.ndarray) -> np.ndarray:
         """Returns the cells (N,) bool all of whose corners are among the nodes (nodes,) bool."""

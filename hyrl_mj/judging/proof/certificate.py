@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hyrl_mj.judging.game import NEVER, Game, Moves, share, solve
+from hyrl_mj.judging.game import NEVER, Game, Moves, Places, share, solve
 from hyrl_mj.judging.proof.affine import Unbounded
 from hyrl_mj.judging.proof.answers import BoundedAnswers
 from hyrl_mj.judging.proof.cells import Cells
@@ -84,27 +84,11 @@ class Certificate:
     def value(self, name: str, eps: float) -> np.ndarray:
         """Returns an upper bound of the value of the closed loop (modes + 1, places), as `Game.value`."""
         if (name, eps) not in self._values:
-            moves = self.moves(name, eps)
-            staying = self._staying(moves)
-            self._values[name, eps] = solve(moves, self.game.task.max_steps, staying)
+            moves, cells = self.moves(name, eps), self.cells
+            assert cells is not None
+            stays = staying(moves, cells, cells.success)
+            self._values[name, eps] = solve(moves, self.game.task.max_steps, stays)
         return self._values[name, eps]
-
-    def _staying(self, moves: Moves) -> np.ndarray:
-        """Returns from which states a run stays in cells of success, or ends as one: (rows, N) bool."""
-        cells = self.cells
-        assert cells is not None
-        over = np.append(cells.arrived, [True, False])
-        stays = np.append(cells.success & ~cells.arrived, [False, False])
-        over, stays = (np.tile(mask, moves.rows) for mask in (over, stays))
-        inside = np.zeros(stays.size, dtype=bool)
-        inside[moves.state] = stays[moves.state]
-        begin = np.append(0, np.cumsum(moves.counts)[:-1])
-        while True:
-            good = (inside | over)[moves.target]
-            leaves = ~np.logical_and.reduceat(good, begin) & inside[moves.state]
-            if not leaves.any():
-                return inside.reshape(moves.rows, -1)[:, :-2]
-            inside[moves.state[leaves]] = False
 
     def region(self, eps: float) -> np.ndarray:
         """Returns the winnable cells (N,) bool: those of the start region all of whose corners are winnable.
@@ -123,3 +107,19 @@ class Certificate:
         latest, latest_any = (float(x[x < NEVER].max(initial=0)) for x in (own, worst))
         dt = self.game.task.dt
         return Proved(share(own < NEVER), share(worst < NEVER), latest * dt, latest_any * dt)
+
+
+def staying(moves: Moves, places: Places, success: np.ndarray) -> np.ndarray:
+    """Returns whether a run stays in places of success (N,) bool, or ends as one: (rows, N) bool."""
+    over = np.append(places.arrived, [True, False])
+    stays = np.append(success & ~places.arrived, [False, False])
+    over, stays = (np.tile(mask, moves.rows) for mask in (over, stays))
+    inside = np.zeros(stays.size, dtype=bool)
+    inside[moves.state] = stays[moves.state]
+    begin = np.append(0, np.cumsum(moves.counts)[:-1])
+    while True:
+        good = (inside | over)[moves.target]
+        leaves = ~np.logical_and.reduceat(good, begin) & inside[moves.state]
+        if not leaves.any():
+            return inside.reshape(moves.rows, -1)[:, :-2]
+        inside[moves.state[leaves]] = False
