@@ -13,6 +13,7 @@ from manual import ROOT
 
 import hyrl_mj
 from hyrl_mj import BadInput, Noise, RunOptions, Sensor, cli
+from hyrl_mj.judging.game import percent
 from hyrl_mj.pipeline import ExamineOptions, examine_run
 from hyrl_mj.pipeline.runs import settings_of
 from hyrl_mj.simulation import (
@@ -28,6 +29,7 @@ from hyrl_mj.simulation import (
 from hyrl_mj.simulation.noise import noise_class
 from hyrl_mj.simulation.sensors import Part
 from hyrl_mj.viz import beginning
+from hyrl_mj.viz.tables import robustness_sentence, sensed_table
 
 VEHICLE, CIRCLE = "vehicle", "unit_circle"
 
@@ -383,6 +385,12 @@ def test_a_run_is_made_for_a_bound_that_covers_the_sensor(late, capsys):
     assert not covers_sensor(run.task, 0.149)
     assert "noise of up to 0.05005 m on x and 0.15005 m on y" in str(run.verdict.reasons)
     assert any("within that bound: uniform 0.05" in reason for reason in run.verdict.reasons)
+    sensed = run.robustness.game.sensed
+    assert [*sensed] == ["policy", "hyrl"]
+    under = sensed_table(run.task, run.robustness.game)
+    assert under.rows[1] == ["HyRL", *map(percent, vars(sensed["hyrl"]).values())]
+    assert any(f"from {under.rows[1][1]} of all starts" in reason for reason in run.verdict.reasons)
+    assert f"HyRL {under.rows[1][1]} proved" in robustness_sentence(run.robustness)
     arc = hyrl_mj.simulate(run.task, run.controller, [0.0, 0.3], Noise("sensor"))
     assert arc.measured[1, 0] == arc.z[0, 0]
     assert "--noise 'uniform 0.05 + bias 0.05 + delay 1'" in beginning(run)
