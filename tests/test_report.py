@@ -285,7 +285,7 @@ def test_the_scores_are_those_of_the_game(copied):
                 assert float(row["excursion [rad]"]) == pytest.approx(score.excursion, abs=1e-3)
     for row, (who, margin) in zip(page.table("Margins"), game.margin.items(), strict=True):
         assert row["controller"] == names[who]
-        shown = row["no node is lost up to noise"]
+        shown = row["largest noise without a lost state"]
         unit = run.task.chart.units[0]
         assert shown == ("none" if margin is None else f"{margin:.3g} {unit}")
         (off,) = [float(cell) for heading, cell in row.items() if "no noise" in heading]

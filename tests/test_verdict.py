@@ -184,8 +184,8 @@ def test_a_split_that_makes_most_starts_unwinnable_has_no_first_word(circle):
         found = Verdict.judge(circle, EPS, little, HOLDS, ALL)
         assert found.word == WEAK
         assert found.sentence == (
-            f"this split can win only 89.00% of the starts under {NOISE}, where 100% are open to one who "
-            "sees the state"
+            f"any controller with this split can guarantee at most 89.00% of the starts under {NOISE}, where "
+            "with perfect measurements 100% can be won"
         )
 
 
@@ -370,15 +370,16 @@ def test_a_verdict_reads_as_a_sentence_with_reasons(circle, capsys):
         f"WON: HyRL lost none of the winnable starts, 90.00% of all, that were tried under the worst {NOISE}"
     )
     assert rest == [
-        f"- under {NOISE} this split can win 90.00% of the starts; to one who sees the state 100% are open",
+        f"- under {NOISE} any controller with this split can guarantee at most 90.00% of the starts; with "
+        "perfect measurements 100% can be won",
         "- without noise HyRL is not known to lose any of the winnable starts, the policy is not known to "
         "lose any",
         f"- under the worst {NOISE} HyRL is not known to lose any of the winnable starts, the policy is "
         "known to lose 10.00%",
         "- HyRL lost none of 1,000 proved starts when they were replayed in MuJoCo",
         "- stage 1: the policy arrives from 1,000 of 1,000 starts without noise",
-        "- stage 6: the policy of mode 0 (clockwise) wins all of its set that was tried, after 1 training",
-        "- stage 6: the policy of mode 1 (counter-clockwise) wins all of its set that was tried, without a "
+        "- stage 6: the policy of mode 0 (clockwise) wins every state tested in its set, after 1 training",
+        "- stage 6: the policy of mode 1 (counter-clockwise) wins every state tested in its set, without a "
         "training of its own",
     ]
 

@@ -78,10 +78,8 @@ def mode_sentence(task: Task, result: ModeResult) -> str:
         else "without a training of its own"
     )
     mode = f"the policy of mode {task.mode_name(result.mode)}{POLICIES.get(result.policy, '')}"
-    won = (
-        "all of its set that was tried" if result.won == 1 else f"{percent(result.won)} of its set"
-    )
-    return f"{mode} wins {won}, {how}"
+    won = "every state tested in" if result.won == 1 else f"{percent(result.won)} of"
+    return f"{mode} wins {won} its set, {how}"
 
 
 def listed(words: Sequence[str]) -> str:

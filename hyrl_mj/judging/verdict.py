@@ -317,8 +317,8 @@ class _Case:
             )
         if not self.fair:
             yield (
-                f"this split can win only {percent(self.winnable)} of the starts under {self.noise}, where "
-                f"{percent(self.open)} are open to one who sees the state"
+                f"any controller with this split can guarantee at most {percent(self.winnable)} of the "
+                f"starts under {self.noise}, where with perfect measurements {percent(self.open)} can be won"
             )
         if not self.examined:
             yield (
@@ -352,8 +352,9 @@ class _Case:
         """Yields what is won in the worst-case game."""
         if self.winnable < 1:
             yield (
-                f"under {self.noise} this split can win {percent(self.winnable)} of the starts; to one who "
-                f"sees the state {percent(self.open)} are open"
+                f"under {self.noise} any controller with this split can guarantee at most "
+                f"{percent(self.winnable)} of the starts; with perfect measurements {percent(self.open)} "
+                "can be won"
             )
         assert self.robustness.deciding
         policy, hyrl = (self.robustness.deciding.scores[who] for who in ("policy", "hyrl"))

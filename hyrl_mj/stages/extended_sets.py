@@ -84,7 +84,7 @@ class ExtendedSets(Saved):
         return np.asarray(self.room < 2 * self.eps - self.sets[0].grid.cell)
 
     def _narrow_places(self, task: Task) -> Iterator[str]:
-        """Yields between which modes nobody can change over in time, and where."""
+        """Yields between which modes nobody can switch in time, and where."""
         unit, narrow = task.noise_on()[1], self.narrow
         pairs, counts = np.unique(self.between[narrow], axis=0, return_counts=True)
         most = np.argsort(-counts, kind="stable")[:3]
@@ -94,11 +94,11 @@ class ExtendedSets(Saved):
             left = self.room[here & narrow].min()
             place = where(task.chart, self.points[here], narrow[here])
             yield (
-                f"between {first} and {second} nobody can change over safely {place}: "
-                f"{2 * self.eps:g} {unit} of room are needed, and as little as {left:.2g} is left"
+                f"between {first} and {second}, {place}, the overlap is as little as {left:.2g} {unit} wide; "
+                f"switching safely needs {2 * self.eps:g} {unit}"
             )
         if more := len(pairs) - len(most):
-            yield f"nor in places between {counted(more, 'other pair')} of modes"
+            yield f"so it is in places between {counted(more, 'other pair')} of modes"
 
     def _shared(self) -> str:
         """Returns how much of the chart the sets of modes that meet share."""

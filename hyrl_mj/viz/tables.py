@@ -77,7 +77,7 @@ def replay_table(run: Run, arcs: Arcs) -> Table:
         endings = [_ending(task, arcs[start, who]) for who in columns]
         rows.append([f"{point} on M*" if start == "critical" else point, *endings])
     headings = [f"start ({', '.join(task.chart.names)}) in {units}", *columns.values()]
-    noise = f"alternating noise {s.eps:g}{', on M* the strongest known' if run.exact else ''}"
+    noise = f"alternating noise {s.eps:g}{', on M* the strongest found' if run.exact else ''}"
     return Table(f"{task.name}: {noise}, seed {s.seed}", headings, rows)
 
 
@@ -156,7 +156,7 @@ def margin_table(task: Task, game: GameResult) -> Table:
     rows = [
         {
             "controller": NAMES[who],
-            "no node is lost up to noise": margin_text(margin, unit),
+            "largest noise without a lost state": margin_text(margin, unit),
             f"{100 * NEARLY:.0f}% is proved up to noise": margin_text(
                 game.proved_margin[who], unit
             ),

@@ -118,8 +118,8 @@ class Lattice(Places):
             return f"the worst-case game takes a chart of 1 to 3 dimensions, that of {task.name} has {d}"
         if not task.chart_is_state:
             return (
-                "the worst-case game takes a plant that one sample maps from chart point to chart point, "
-                f"and {task.name} has a larger state"
+                "the exact worst case needs a plant whose whole state is the chart, and "
+                f"{task.name} has a larger state"
             )
         if grid is None:
             return None

@@ -211,5 +211,5 @@ def _margins(panel: Axes, shown: ShownGame, unit: str) -> None:
             panel.plot([], [], linestyle="none", label=f"{label}: none")
             continue
         looks = CURVES[name] | {"marker": "v", "linestyle": "none", "markevery": None}
-        label += f": no node is lost up to {margin:.3g} {unit}"
+        label += f": {margin:.3g} {unit}"
         panel.plot([margin], [105 + 5 * row], label=label, **looks)
