@@ -83,6 +83,12 @@ def test_an_unknown_kind_lists_the_known():
         Noise("pink", 0.1)
 
 
+@pytest.mark.parametrize("kind", ["worst", "attack"])
+def test_noise_that_has_to_be_found_says_so(kind):
+    with pytest.raises(BadInput, match=f"found first.*--noise {kind}"):
+        Noise(kind, 0.1)
+
+
 def test_a_misspelt_kind_gets_a_hint():
     with pytest.raises(BadInput, match=r"Did you mean 'alternating'\?"):
         Noise("alternate", 0.1)

@@ -20,6 +20,7 @@ from hyrl_mj.judging.game import (
 from hyrl_mj.policies import Controller, Policy
 from hyrl_mj.runs.directory import Run
 from hyrl_mj.simulation import (
+    OF_RUNS,
     AnyNoise,
     HybridArc,
     Noise,
@@ -71,7 +72,7 @@ def noisy_arcs(
         BadInput: a value that cannot be used, or a worst case that cannot be played.
     """
     task = run.task  # first: the file of a user's task may register noise
-    kinds = (*noise_kinds(), "worst", "attack")
+    kinds = (*noise_kinds(), *OF_RUNS)
     sensor = noise_of(task, noise, 0.0) if " " in noise.strip() else None
     if sensor is None and noise not in kinds:
         raise unknown(

@@ -10,6 +10,7 @@ from hyrl_mj.simulation.lookahead import Ahead, Lookahead
 from hyrl_mj.simulation.noise import (
     KINDS,
     NOT_STARTED,
+    OF_RUNS,
     SENSOR,
     AnyNoise,
     Noise,
@@ -35,6 +36,7 @@ __all__ = [
     "KINDS",
     "LONGEST",
     "NOT_STARTED",
+    "OF_RUNS",
     "SENSOR",
     "Ahead",
     "AnyNoise",

@@ -37,8 +37,9 @@ KINDS = ("none", "uniform", "alternating", "adversarial")
 SENSOR = "sensor"
 # The words of parts of sensors that are not noise which is added to a sample; and of the errors of a log.
 DELAY, HOLD, QUANTUM, LOG = "delay", "hold", "quantum", "log"
-# Words that are no kind where noise is named: these, and what looks at a whole run.
-RESERVED = (DELAY, HOLD, QUANTUM, LOG, "attack", "worst")
+# Words that are no kind where noise is named: these, and noise that is searched for against a controller.
+OF_RUNS = ("attack", "worst")
+RESERVED = (DELAY, HOLD, QUANTUM, LOG, *OF_RUNS)
 # What follows the last sample of a recorded signal.
 After = Literal["refuse", "hold", "repeat", "none"]
 
@@ -147,6 +148,11 @@ def register_noise(signal: type[AnySignal]) -> type[AnySignal]:
 
 def noise_class(kind: str) -> type[Signal]:
     """Returns the class of a kind of noise; raises `BadInput` for a kind that is not registered."""
+    if kind in OF_RUNS:
+        raise BadInput(
+            f"noise {kind!r} is another signal for each controller, which has to be found first: use hyrl-mj "
+            f"simulate RUN --start ... --noise {kind}, or in Python Game(...).worst_noise(name, eps)"
+        )
     if kind not in _KINDS:
         raise unknown("noise", kind, _KINDS)
     return _KINDS[kind]
