@@ -343,7 +343,22 @@ def test_options_of_files_are_not_taken_for_functions(circle):
 
 def test_its_network_is_not_taken_for_one_on_plain_observations(circle, tmp_path):
     _, path, needs = agent(PPO, circle, tmp_path, WRAPPED["normalised"])
-    assert not isinstance(load_agent(path, circle, **needs), MlpPolicy)
+    loaded = load_agent(path, circle, **needs)
+    assert not isinstance(loaded, MlpPolicy)
+    read_agent(circle, path, **needs).store(tmp_path)
+    stored, statistics = tmp_path / "policy.safetensors", tmp_path / "vecnormalize.npz"
+    with pytest.raises(BadInput, match=f"saw normalised .* give --vecnormalize {statistics}"):
+        load_agent(stored, circle)
+    again = load_agent(stored, circle, vecnormalize=statistics)
+    seen = np.random.default_rng(0).normal(size=(30, 2))
+    np.testing.assert_array_equal(again.inputs(seen), loaded.inputs(seen))
+
+
+def test_a_stack_that_begins_with_copies_is_not_taken_for_one_of_zeros(vehicle, tmp_path):
+    env = gym.wrappers.FrameStackObservation(gym.make(vehicle.env_id), 3)
+    path = saved(PPO("MlpPolicy", env, n_steps=64, device="cpu"), tmp_path)
+    with pytest.raises(BadArtifact, match=r"shape \[3, 3\], as FrameStackObservation gives"):
+        load_agent(path, vehicle, n_stack=3)
 
 
 # ---- modules of torch

@@ -264,10 +264,12 @@ class _Case:
     @property
     def samples(self) -> list[Sample]:
         """What HELD rests on: episodes without noise and of each kind of noise, and attacked starts."""
-        counts, s = by_kind(self.robustness, "hyrl"), self.settings
+        counts, s, found = by_kind(self.robustness, "hyrl"), self.settings, self.robustness
         samples = [
             Sample(kind, *counts.get(kind, (0, 0)), False, s.episodes)
-            for kind in dict.fromkeys((*usual_kinds(self.task, self.robustness.eps), *counts))
+            for kind in dict.fromkeys(
+                (*usual_kinds(self.task, found.eps, found.everywhere), *counts)
+            )
         ]
         attacks = [c for c in self.robustness.attacks if c.controller == "hyrl"]
         won, total = next(((c.attacked - c.lost, c.attacked) for c in attacks), (0, 0))

@@ -31,6 +31,12 @@ def from_onnx(path: Path, task: Task, n_stack: int) -> FunctionPolicy:
     with artifacts.reading(path, REMEDY):
         model = artifacts.read_limited(path, 2**25)  # the largest MLP policies take a few megabytes
         found = _examined(model, columns, task)
+        low, high = task.input_limits
+        if found["squashed"] and task.input_levels is None and not np.allclose([-low, high], 1):
+            raise BadArtifact(
+                f"it ends in Tanh, so that it gives numbers between -1 and 1, and inputs of {task.name} lie "
+                f"between {low} and {high}: let the model scale them, as SB3's unscale_action does"
+            )
         from hyrl_mj.policies.onnx_trial import session_of  # slow to import, and only needed here
 
         session = session_of(model)
@@ -40,7 +46,8 @@ def from_onnx(path: Path, task: Task, n_stack: int) -> FunctionPolicy:
         n = len(observation)
         # No other numbers of rows than were tried.
         rows = ROWS if found["batches"] and n > 1 else 1
-        whole = np.pad(observation, ((0, -n % rows), (0, 0)))
+        # An environment may observe float64.
+        whole = np.pad(observation.astype(np.float32), ((0, -n % rows), (0, 0)))
         parts = [whole[i : i + rows] for i in range(0, len(whole), rows)]
         outputs = [session.run([output_name], {input_name: part})[0] for part in parts]
         actions = np.concatenate(outputs)
