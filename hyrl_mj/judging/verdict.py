@@ -345,7 +345,7 @@ class _Case:
             where = listed(self.task.chart.names)
             yield f"what the sensors do to {where} is within that bound: {self.task.sensor}"
         yield from self._shares() if self.robustness.deciding else self._counts()
-        yield from map(comparison_sentence, self.robustness.comparisons)
+        yield from (comparison_sentence(self.task, c) for c in self.robustness.comparisons)
         yield f"stage 1: the policy {self.arrivals}"
         for result in self.retraining.modes:
             yield f"stage 6: {mode_sentence(self.task, result)}"
