@@ -11,7 +11,7 @@ from planted import random_states
 from stable_baselines3 import DQN, PPO, SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
-from test_agents import OFF_POLICY, onnx_file, saved
+from test_agents import OFF_POLICY, Lopsided, onnx_file, saved
 
 import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, Noise, load_agent, simulate
@@ -384,6 +384,15 @@ def test_a_module_of_torch_is_a_function(circle, vehicle):
             np.testing.assert_allclose(ours, np.clip(theirs, -1, 1), atol=1e-6)
         assert read_agent(task, network).agent.algorithm == "function"
         assert all(p.grad is None for p in network.parameters())
+
+
+def test_a_module_that_ends_in_tanh_is_refused_where_inputs_have_other_limits(circle):
+    network = torch.nn.Sequential(torch.nn.Linear(2, 1), torch.nn.Sequential(torch.nn.Tanh()))
+    assert hyrl_mj.from_callable(network, circle).act(np.ones((2, 1))).shape == (2, 1)
+    with pytest.raises(BadInput, match=r"ends in Tanh, .* let it scale them"):
+        hyrl_mj.from_callable(network, Lopsided())
+    network.append(torch.nn.Hardtanh(-3, 3))
+    hyrl_mj.from_callable(network, Lopsided())
 
 
 class Pair(torch.nn.Module):

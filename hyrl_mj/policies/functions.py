@@ -329,6 +329,8 @@ def from_callable(function: PythonAgent, task: Task) -> FunctionPolicy | Remembe
         sb3 = {"state", "episode_start", "deterministic"}
         if sb3 <= _arguments(getattr(function, "predict", None)):
             return _predicting(cast(Predicts, function), task)
+        if _last_part(function) == "Tanh":
+            check_scaled(task, "the module")
         return FunctionPolicy(task, _of_arrays(function), "the module")
     if callable(function):
         return FunctionPolicy(task, function)
@@ -344,6 +346,23 @@ def _is_module(function: object) -> bool:
     """Returns whether an object is a `torch.nn.Module`; it is none if nobody has imported torch."""
     torch = sys.modules.get("torch")
     return torch is not None and isinstance(function, torch.nn.Module)
+
+
+def _last_part(module: Any) -> str:
+    """Returns the name of the last part of a `torch.nn.Sequential`, or of another module itself."""
+    while type(module).__name__ == "Sequential" and len(module):
+        module = module[-1]
+    return type(module).__name__
+
+
+def check_scaled(task: Task, name: str) -> None:
+    """Raises `BadInput` where a model that ends in Tanh has other inputs than a task."""
+    low, high = task.input_limits
+    if task.input_levels is None and not np.allclose([-low, high], 1):
+        raise BadInput(
+            f"{name} ends in Tanh, so that it gives numbers between -1 and 1, and inputs of {task.name} lie "
+            f"between {low} and {high}: let it scale them, as SB3's unscale_action does"
+        )
 
 
 def _of_arrays(module: Any) -> Callable[[np.ndarray], np.ndarray]:

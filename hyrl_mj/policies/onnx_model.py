@@ -10,7 +10,7 @@ import numpy as np
 
 from hyrl_mj.errors import BadArtifact, BadInput
 from hyrl_mj.files import artifacts
-from hyrl_mj.policies.functions import FunctionPolicy
+from hyrl_mj.policies.functions import FunctionPolicy, check_scaled
 from hyrl_mj.policies.sb3_zip import REMEDY
 from hyrl_mj.system import limits
 from hyrl_mj.tasks import Task
@@ -31,12 +31,6 @@ def from_onnx(path: Path, task: Task, n_stack: int) -> FunctionPolicy:
     with artifacts.reading(path, REMEDY):
         model = artifacts.read_limited(path, 2**25)  # the largest MLP policies take a few megabytes
         found = _examined(model, columns, task)
-        low, high = task.input_limits
-        if found["squashed"] and task.input_levels is None and not np.allclose([-low, high], 1):
-            raise BadArtifact(
-                f"it ends in Tanh, so that it gives numbers between -1 and 1, and inputs of {task.name} lie "
-                f"between {low} and {high}: let the model scale them, as SB3's unscale_action does"
-            )
         from hyrl_mj.policies.onnx_trial import session_of  # slow to import, and only needed here
 
         session = session_of(model)
@@ -56,6 +50,8 @@ def from_onnx(path: Path, task: Task, n_stack: int) -> FunctionPolicy:
 
     policy = FunctionPolicy(task, function, f"the model of {path}")
     try:
+        if found["squashed"]:
+            check_scaled(task, policy.name)
         policy.inputs(np.zeros((2, columns)))
     except BadInput as error:
         raise BadArtifact(str(error)) from error
