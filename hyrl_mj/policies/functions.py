@@ -2,7 +2,7 @@
 
 import inspect
 import sys
-from collections.abc import Callable, Set
+from collections.abc import Callable, Mapping, Set
 from dataclasses import dataclass
 from typing import Any, Protocol, cast
 
@@ -231,7 +231,7 @@ def _seen_by(model: Any, task: Task) -> Callable[[np.ndarray], Any]:
     """Returns how a model sees observations (n, k): in the shape of its space, or as the parts of a Dict."""
     space, parts = getattr(model, "observation_space", None), task.observation_parts
     ends = np.cumsum([*parts.values()])[:-1]
-    if (spaces := getattr(space, "spaces", None)) is not None:
+    if isinstance(spaces := getattr(space, "spaces", None), Mapping):
         return lambda o: {
             key: part.reshape(len(o), *spaces[key].shape)
             for key, part in zip(parts, np.split(o, ends, axis=1), strict=True)
@@ -242,16 +242,17 @@ def _seen_by(model: Any, task: Task) -> Callable[[np.ndarray], Any]:
 def _check_model(model: Any, task: Task) -> None:
     """Raises `BadInput` if an SB3 model was trained on other observations or inputs than those of a task."""
     space = getattr(model, "observation_space", None)
-    spaces, ours = getattr(space, "spaces", None), dict(task.observation_parts)
-    if spaces is None:
-        spaces, ours = {"": space}, {"": len(task.observation_low)}
-    if space is not None and {key: np.prod(s.shape) for key, s in spaces.items()} != ours:
-        gives = (
-            ours if getattr(space, "spaces", None) and ours else f"({len(task.observation_low)},)"
-        )
+    spaces, k, parts = getattr(space, "spaces", None), len(task.observation_low), {}
+    if isinstance(spaces, Mapping):
+        ours = parts = dict(task.observation_parts)
+    else:
+        spaces, ours = {"": space}, {"": k}
+    sizes = {key: np.prod(getattr(one, "shape", None) or -1) for key, one in spaces.items()}
+    if space is not None and sizes != ours:
+        observes = getattr(space, "shape", None) or space
         raise BadInput(
-            f"the model observes {space.shape or space}, and {task.name} gives {gives}: train it on that, or "
-            "give a function that makes its observations"
+            f"the model observes {observes}, and {task.name} gives {parts or f'({k},)'}: train it on that, "
+            "or give a function that makes its observations"
         )
     sb3_metadata.check_model(model, task)
     if "action_masks" in _arguments(getattr(model, "predict", None)):
@@ -263,7 +264,8 @@ def _check_model(model: Any, task: Task) -> None:
     levels = task.input_levels
     if actions is None:
         return
-    if levels is not None and (actions.shape, getattr(actions, "n", 0)) != ((), len(levels)):
+    shape, n = (getattr(actions, name, None) for name in ("shape", "n"))
+    if levels is not None and (shape, n) != ((), len(levels)):
         raise BadInput(
             f"the model's actions are {actions}, and {task.name} takes one of {len(levels)} levels: train it "
             "on them, or give a function that chooses among them"

@@ -153,7 +153,7 @@ def _wrapped(
     """Returns by what an agent shows that it saw observations that the task does not give, "" if by nothing.
 
     So it is with `NormalizeObservation` and other wrappers inside of the environment of the training.
-    `limits` and `dtype` are those of its space, (k,) and (k,), if they are known.
+    `limits`, (k,) each, and `dtype` are those of the space of its observations, if they are known.
     """
     task, joined = possible.task, None if last is None else _joined(last)
     given = None if joined is None else possible.include(joined)
