@@ -21,6 +21,7 @@ from hyrl_mj.gym_export.core import BatchedEnv
 from hyrl_mj.gym_export.sb3_env import TaskVecEnv
 from hyrl_mj.learning.presets import preset
 from hyrl_mj.learning.training import build
+from hyrl_mj.policies.external import read_agent
 from hyrl_mj.policies.mlp import ACTIVATIONS, TORCH_NAMES, SampledPolicy
 from hyrl_mj.tasks.unit_circle import UnitCircle
 
@@ -140,6 +141,21 @@ def test_inputs_are_stretched_to_the_limits_of_the_task(algorithm, tmp_path):
     assert_it_acts_alike(policy, model, task, observations(task))
     u = policy.inputs(observations(task))
     assert -0.5 <= u.min() < 0 < 1 < u.max() <= 3
+    # A policy of SB3 is a module whose forward() draws, or gives numbers between -1 and 1.
+    for part in (model, model.policy):
+        assert_it_acts_alike(from_callable(part, task), model, task, observations(task))
+
+
+def test_a_policy_that_takes_observations_by_its_name_is_refused(vehicle):
+    class Steers:
+        def act(self, observations):
+            return np.sign(observations[:, 1:2])
+
+    for use in (read_agent, lambda task, agent: hyrl_mj.simulate(task, agent, [0.0, 0.1])):
+        with pytest.raises(
+            BadInput, match=r"act\(observations\) .*from_callable\(agent\.act, task\)"
+        ):
+            use(vehicle, Steers())
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)
@@ -503,8 +519,11 @@ def test_what_is_no_function_is_refused(circle):
 # ---- ONNX
 
 
-def onnx_file(folder, weight, bias, rows="n", integers=False, dtype=np.float32):
-    """An ONNX file of a linear layer, (n, k) -> (n, m); with `integers` the number of the greatest."""
+def onnx_file(folder, weight, bias, rows="n", integers=False, dtype=np.float32, squashed=False):
+    """An ONNX file of a linear layer, (n, k) -> (n, m); with `integers` the number of the greatest.
+
+    If it is `squashed`, Tanh follows, and then the shape that it has already.
+    """
     import onnx
 
     kind = onnx.helper.np_dtype_to_tensor_dtype(np.dtype(dtype))
@@ -514,6 +533,10 @@ def onnx_file(folder, weight, bias, rows="n", integers=False, dtype=np.float32):
     if integers:
         nodes.append(onnx.helper.make_node("ArgMax", ["linear"], ["best"], axis=1, keepdims=0))
         out = onnx.helper.make_tensor_value_info("best", onnx.TensorProto.INT64, [rows])
+    if squashed:
+        nodes.append(onnx.helper.make_node("Tanh", ["linear"], ["tanh"]))
+        nodes.append(onnx.helper.make_node("Flatten", ["tanh"], ["flat"]))
+        out = onnx.helper.make_tensor_value_info("flat", kind, [rows, weight.shape[0]])
     tensors = [
         onnx.numpy_helper.from_array(value.astype(dtype), name)
         for value, name in ((weight, "w"), (bias, "b"))
@@ -536,14 +559,31 @@ def numbers():
     return np.random.default_rng(0)
 
 
-@pytest.mark.parametrize("rows", ["n", 1])
-def test_an_onnx_model_acts(rows, circle, runtime, numbers, tmp_path):
+@pytest.mark.parametrize(("rows", "observed"), [("n", ""), (1, ""), ("n", "float64")])
+def test_an_onnx_model_acts(rows, observed, circle, runtime, numbers, tmp_path, monkeypatch):
+    # As of the environments of Gymnasium that MuJoCo simulates.
+    monkeypatch.setattr(type(circle), "observation_dtype", observed)
     weight, bias = numbers.normal(size=(1, 2)), numbers.normal(size=1)
     policy = load_agent(onnx_file(tmp_path, weight, bias, rows), circle)
     observation = observations(circle, 200)
     expected = np.clip(observation @ weight.T + bias, *circle.input_limits)
     np.testing.assert_allclose(policy.inputs(observation), expected, atol=1e-5)
     assert policy.act(np.zeros((1, 1))).shape == (1, 1)
+
+
+def test_an_onnx_model_that_ends_in_tanh_has_inputs_between_one_and_minus_one(
+    circle, runtime, numbers, tmp_path
+):
+    weight, bias = numbers.normal(size=(1, 2)), numbers.normal(size=1)
+    path = onnx_file(tmp_path, weight, bias, squashed=True)
+    expected = np.tanh(observations(circle) @ weight.T + bias)
+    np.testing.assert_allclose(
+        load_agent(path, circle).inputs(observations(circle)), expected, atol=1e-5
+    )
+    with pytest.raises(
+        BadArtifact, match=r"ends in Tanh, .* inputs of unit_circle lie between \[-0"
+    ):
+        load_agent(path, Lopsided())
 
 
 @pytest.mark.parametrize("integers", [False, True])

@@ -295,6 +295,21 @@ def test_an_agent_of_another_number_of_levels_is_refused(vehicle, tmp_path):
     refused(path, vehicle, "chooses among 7 levels, vehicle has 5")
 
 
+@pytest.mark.parametrize(
+    ("key", "part", "value", "message"),
+    [
+        ("action_space", ":type:", "<class 'a.MultiDiscrete'>", "not numbers of 5 levels.*MultiD"),
+        ("action_space", ":type:", "<class 'a.MultiBinary'>", "not numbers of 5 levels.*MultiB"),
+        ("policy_class", "__module__", "sb3_contrib.common.maskable.policies", "a mask allows"),
+    ],
+)
+def test_what_levels_do_not_mean_is_refused(key, part, value, message, vehicle, tmp_path):
+    path = saved(untrained(PPO, vehicle, net_arch=[8]), tmp_path)
+    found = json.loads(members(path)["data"])[key]
+    with_metadata(path, **{key: found | {part: value}})
+    refused(path, vehicle, message)
+
+
 def test_sbx_is_named(agent, circle):
     about = json.loads(members(agent)["data"])
     about["policy_class"] = {":type:": "<class 'abc.ABCMeta'>", "__module__": "sbx.ppo.policies"}

@@ -480,9 +480,39 @@ def test_a_model_of_other_observations_or_actions_is_refused(circle, tmp_path):
         from_callable(PPO.load(tmp_path / "model.zip", device="cpu"), circle)
     with pytest.raises(BadInput, match="was trained under VecNormalize"):
         from_callable(PPO("MlpPolicy", env, n_steps=64), circle)
-    model.action_space = gym.spaces.Box(-2, 2, (1,))
-    with pytest.raises(BadInput, match="give a function that scales them"):
-        from_callable(model, circle)
+    for space in (gym.spaces.Box(-2, 2, (1,)), gym.spaces.MultiDiscrete([5])):
+        model.action_space = space
+        with pytest.raises(BadInput, match="give a function that scales them"):
+            from_callable(model, circle)
+    vehicle = hyrl_mj.get_task("vehicle")
+    levels = PPO("MlpPolicy", TaskVecEnv(BatchedEnv(vehicle, 1)), n_steps=64, device="cpu")
+    assert from_callable(levels, vehicle).act(np.ones((2, 2))).shape == (2, 1)
+    spaces = gym.spaces.MultiBinary(5), gym.spaces.MultiDiscrete([5]), gym.spaces.Box(-1, 1, (5,))
+    for space in (*spaces, gym.spaces.Discrete(4)):
+        levels.action_space = space
+        with pytest.raises(BadInput, match="vehicle takes one of 5 levels"):
+            from_callable(levels, vehicle)
+
+
+def test_a_model_with_masks_is_refused(vehicle):
+    class Masked:
+        def predict(self, observation, state=None, episode_start=None, action_masks=None):
+            return np.zeros(len(observation), dtype=int), None
+
+    with pytest.raises(BadInput, match="a mask allows, and vehicle has no masks"):
+        from_callable(Masked(), vehicle)
+
+
+def test_a_model_that_saw_what_a_wrapper_made_is_refused(circle, tmp_path):
+    env = gym.wrappers.NormalizeObservation(gym.make(circle.env_id))
+    model = PPO("MlpPolicy", env, n_steps=64, seed=0, device="cpu").learn(64)
+    model.save(tmp_path / "model.zip")
+    given = [PPO.load(tmp_path / "model.zip", env=other, device="cpu") for other in (None, env)]
+    for found in (model, *given):
+        with pytest.raises(
+            BadInput, match=r"wrapper such as NormalizeObservation: .* asks the model"
+        ):
+            from_callable(found, circle)
 
 
 @pytest.mark.parametrize("algorithm", [PPO, SAC])

@@ -5,14 +5,15 @@ from collections import OrderedDict
 import numpy as np
 import pytest
 import torch
-from environments import Puck
+from environments import Puck, puck_agent
 from gymnasium import spaces
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
 import hyrl_mj
-from hyrl_mj import BadArtifact, load_agent
+from hyrl_mj import BadArtifact, BadInput, Noise, from_callable, load_agent
 from hyrl_mj.policies.external import read_agent, reopen_agent
+from hyrl_mj.simulation import Recorded
 
 STEPS = 20
 WRAPPED = {
@@ -71,6 +72,28 @@ def test_in_a_closed_loop_it_acts_as_under_sb3(kind, wrapped, puck, tmp_path):
     arc = hyrl_mj.simulate(puck, load_agent(path, puck, **needs), start)
     np.testing.assert_allclose(arc.u[: STEPS - 1], actions, atol=1e-4)
     np.testing.assert_allclose(arc.z[1:STEPS], places, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["MultiInputPolicy", "MultiInputLstmPolicy"])
+def test_a_model_of_a_dict_acts_itself(name, puck):
+    kind = pytest.importorskip("sb3_contrib").RecurrentPPO if "Lstm" in name else SAC
+    model = kind(name, Puck(), seed=0, device="cpu", policy_kwargs={"net_arch": [16]})
+    seen = np.random.default_rng(0).normal(size=(20, 6)).astype(np.float32)
+    ends = np.cumsum([*puck.observation_parts.values()])[:-1]
+    parts = dict(zip(puck.observation_parts, np.split(seen, ends, axis=1), strict=True))
+    theirs, _ = model.predict(parts, episode_start=np.ones(20, dtype=bool), deterministic=True)
+    np.testing.assert_allclose(from_callable(model, puck).inputs(seen), theirs, atol=1e-5)
+    with pytest.raises(BadInput, match=r"observes Dict\(.*, and vehicle gives \(3,\)"):
+        from_callable(model, hyrl_mj.get_task("vehicle"))
+
+
+def test_noise_beside_the_chart_of_an_environment_is_refused(puck):
+    policy, signal = from_callable(puck_agent, puck), np.zeros((STEPS + 1, 1, 11))
+    signal[:, 0, 4] = 0.1
+    with pytest.raises(BadInput, match=r"column 4 .* is added to the chart, columns 0 to 1"):
+        hyrl_mj.simulate(puck, policy, [-1.5, 0.2], Recorded(signal, 0.1))
+    arc = hyrl_mj.simulate(puck, policy, [-1.5, 0.2], Noise("uniform", 0.1, everywhere=True))
+    assert (np.abs(arc.measured[:-1, :2] - arc.z[:-1]) > 0).all()
 
 
 def test_a_run_keeps_it_as_it_was(puck, tmp_path):

@@ -177,6 +177,8 @@ SAID = {
     "samples earlier than its reference": lambda log: log | {"x_ref": np.roll(log["x_ref"], 4)},
     "correlated from sample to sample": lambda log: log
     | {"x": log["x_ref"] + signal.lfilter([0.01], [1, -0.7], np.random.default_rng(0).normal(size=6000))},
+    "alternating 0.02 describes it better": lambda log: log
+    | {"x": log["x_ref"] + 0.02 * (-1.0) ** np.arange(6000)},
     "beyond the bound": lambda log: log | {"x": log["x"] + (log["t"] == 200)},
 }  # fmt: skip
 

@@ -189,8 +189,11 @@ def test_a_run_made_for_noise_on_all_coordinates_is_examined_so(vehicle, tmp_pat
 
 def test_episodes_are_added_on_demand(run):
     before, said = run.robustness, []
-    examine_run(run, ExamineOptions(eps=0.05, noise=("uniform",), episodes=20), said.append)
-    assert hyrl_mj.load_run(run.path).robustness != before
+    twice = ("uniform", "uniform")  # is played once
+    examine_run(run, ExamineOptions(eps=0.05, noise=twice, episodes=20), said.append)
+    found = hyrl_mj.load_run(run.path).robustness
+    assert found != before
+    assert sum(count.episodes for count in found.episodes) == 2 * 20
     assert said[-1].startswith("worst case at noise 0.05, of the winnable starts: ")
 
 

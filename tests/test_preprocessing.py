@@ -11,7 +11,7 @@ from planted import random_states
 from stable_baselines3 import DQN, PPO, SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
-from test_agents import OFF_POLICY, onnx_file, saved
+from test_agents import OFF_POLICY, Lopsided, onnx_file, saved
 
 import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, Noise, load_agent, simulate
@@ -343,7 +343,22 @@ def test_options_of_files_are_not_taken_for_functions(circle):
 
 def test_its_network_is_not_taken_for_one_on_plain_observations(circle, tmp_path):
     _, path, needs = agent(PPO, circle, tmp_path, WRAPPED["normalised"])
-    assert not isinstance(load_agent(path, circle, **needs), MlpPolicy)
+    loaded = load_agent(path, circle, **needs)
+    assert not isinstance(loaded, MlpPolicy)
+    read_agent(circle, path, **needs).store(tmp_path)
+    stored, statistics = tmp_path / "policy.safetensors", tmp_path / "vecnormalize.npz"
+    with pytest.raises(BadInput, match=f"saw normalised .* give --vecnormalize {statistics}"):
+        load_agent(stored, circle)
+    again = load_agent(stored, circle, vecnormalize=statistics)
+    seen = np.random.default_rng(0).normal(size=(30, 2))
+    np.testing.assert_array_equal(again.inputs(seen), loaded.inputs(seen))
+
+
+def test_a_stack_that_begins_with_copies_is_not_taken_for_one_of_zeros(vehicle, tmp_path):
+    env = gym.wrappers.FrameStackObservation(gym.make(vehicle.env_id), 3)
+    path = saved(PPO("MlpPolicy", env, n_steps=64, device="cpu"), tmp_path)
+    with pytest.raises(BadArtifact, match=r"shape \[3, 3\], as FrameStackObservation gives"):
+        load_agent(path, vehicle, n_stack=3)
 
 
 # ---- modules of torch
@@ -369,6 +384,15 @@ def test_a_module_of_torch_is_a_function(circle, vehicle):
             np.testing.assert_allclose(ours, np.clip(theirs, -1, 1), atol=1e-6)
         assert read_agent(task, network).agent.algorithm == "function"
         assert all(p.grad is None for p in network.parameters())
+
+
+def test_a_module_that_ends_in_tanh_is_refused_where_inputs_have_other_limits(circle):
+    network = torch.nn.Sequential(torch.nn.Linear(2, 1), torch.nn.Sequential(torch.nn.Tanh()))
+    assert hyrl_mj.from_callable(network, circle).act(np.ones((2, 1))).shape == (2, 1)
+    with pytest.raises(BadInput, match=r"ends in Tanh, .* let it scale them"):
+        hyrl_mj.from_callable(network, Lopsided())
+    network.append(torch.nn.Hardtanh(-3, 3))
+    hyrl_mj.from_callable(network, Lopsided())
 
 
 class Pair(torch.nn.Module):

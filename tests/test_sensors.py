@@ -25,6 +25,7 @@ from hyrl_mj.simulation import (
     covers_sensor,
     noise_of,
     register_noise,
+    usual_kinds,
 )
 from hyrl_mj.simulation.noise import noise_class
 from hyrl_mj.simulation.sensors import Part
@@ -373,6 +374,12 @@ def late(small_runs, made_once, tmp_path_factory):
     """A run that is made for a sensor, which these tests examine again."""
     made = made_once("late", make_late) / "run"
     return hyrl_mj.load_run(shutil.copytree(made, tmp_path_factory.mktemp("late") / "run"))
+
+
+def test_what_a_sensor_does_is_not_judged_where_noise_acts_everywhere(vehicle):
+    task = vehicle.with_sensor("uniform 0.05", (0.0, 1.0))
+    assert usual_kinds(task, 0.1) == (*KINDS, SENSOR)
+    assert usual_kinds(task.noisy_everywhere(), 0.1, everywhere=True) == KINDS
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """The verdict: its word follows from scores, episodes and what the stages know, one condition at a time."""
 
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -22,9 +23,11 @@ from hyrl_mj.judging.game import (
     compare,
     wilson,
 )
+from hyrl_mj.judging.sentences import comparison_sentence
 from hyrl_mj.judging.verdict import Verdict, Word
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.simulation import simulate
+from hyrl_mj.viz.tables import comparison_table
 from hyrl_mj.viz.terminal import print_verdict
 
 PROVED, WON, HELD, UNDECIDED, WEAK, FAILED = Word
@@ -313,6 +316,11 @@ def test_better_is_what_the_same_starts_show(circle):
         "uniform noise: of 1,000 starts that both win without noise the policy loses 160 and HyRL 100 "
         "(difference 6.0 points, 95% interval 2.8 to 9.1); late are 0 and 0"
     ) in verdict.reasons
+    # An episode that goes on after the arrival does not tell when that was.
+    circle = copy(circle)
+    circle.abilities = replace(circle.abilities, arrival_ends=False)
+    assert "late" not in comparison_sentence(circle, far.comparisons[0])
+    assert "-" in comparison_table(circle, far.comparisons).rows[0]
 
 
 def test_each_word_is_said_only_where_its_condition_holds(circle):

@@ -82,6 +82,12 @@ class EnvironmentPlant:
         Each run can be observed once in each sample: what remembers its observations then has seen it.
         """
         d, measured = self.spec.dimension, true.copy()
+        if (beside := noise[:, d:].any(axis=0)).any():
+            raise BadInput(
+                f"noise acts on column {d + int(beside.argmax())} of the measurement, and in "
+                f"{self.spec.name} it is added to the chart, columns 0 to {d - 1}: what is observed there "
+                "follows it"
+            )
         needed = noise[:, :d].any(axis=1) | self.spec.wrapped
         self._sense(ids[needed], noise[needed, :d])
         self._open[ids] = False

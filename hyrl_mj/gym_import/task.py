@@ -238,6 +238,10 @@ class EnvironmentTask(Task):
             found[changed, :d] = z_now
         return found
 
+    def noisy_everywhere(self) -> Self:
+        d, columns = self.chart.dimension, len(self.noisy)
+        return self.with_noise((True,) * d + (False,) * (columns - d))
+
     def perturbed(self, measured: np.ndarray, noise: np.ndarray) -> np.ndarray:
         d = self.chart.dimension
         return self.with_z(measured, measured[:, :d] + noise[:, :d])

@@ -14,7 +14,7 @@ from hyrl_mj.judging.game import MapClass, Maps, Robustness, compare
 from hyrl_mj.judging.worst_case import worst_case
 from hyrl_mj.policies import Controller
 from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.simulation import SENSOR, AttackSettings, HybridArc, noise_of, usual_kinds
+from hyrl_mj.simulation import AttackSettings, HybridArc, noise_of, usual_kinds
 from hyrl_mj.tasks import Effort, Task
 
 
@@ -141,8 +141,9 @@ def examine(
     check_seed(options.seed)
     if count is not None:
         check_count(count)
-    usual = [kind for kind in usual_kinds(task, eps) if not (everywhere and kind == SENSOR)]
-    noises = [noise_of(task, kind, eps, everywhere) for kind in options.noise or usual]
+    # A kind that is named twice would count the same episodes twice.
+    kinds = dict.fromkeys(options.noise or usual_kinds(task, eps, everywhere))
+    noises = [noise_of(task, kind, eps, everywhere) for kind in kinds]
     game, maps = None, None
     if subject.playable:
         bounds = tuple(dict.fromkeys((0.0, eps / 2, eps)))

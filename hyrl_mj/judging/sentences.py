@@ -12,16 +12,17 @@ from hyrl_mj.judging.results import ModeResult
 from hyrl_mj.tasks import Task
 
 
-def comparison_sentence(compared: Comparison) -> str:
+def comparison_sentence(task: Task, compared: Comparison) -> str:
     """Returns what one kind of noise does to both controllers from the same starts."""
     how = "attack" if compared.noise == "attack" else f"{compared.noise} noise"
     low, high = compared.interval
-    lost = compared.lost
+    lost, late = compared.lost, compared.late
+    # Where an episode goes on after the arrival, its end does not tell when that was.
+    of_time = f"; late are {late['policy']:,} and {late['hyrl']:,}" * task.abilities.arrival_ends
     return (
         f"{how}: of {compared.compared:,} starts that both win without noise the policy loses "
         f"{lost['policy']:,} and HyRL {lost['hyrl']:,} (difference {100 * compared.difference:.1f} points, "
-        f"95% interval {100 * low:.1f} to {100 * high:.1f}); late are {compared.late['policy']:,} and "
-        f"{compared.late['hyrl']:,}"
+        f"95% interval {100 * low:.1f} to {100 * high:.1f}){of_time}"
     )
 
 

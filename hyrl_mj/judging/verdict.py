@@ -264,10 +264,12 @@ class _Case:
     @property
     def samples(self) -> list[Sample]:
         """What HELD rests on: episodes without noise and of each kind of noise, and attacked starts."""
-        counts, s = by_kind(self.robustness, "hyrl"), self.settings
+        counts, s, found = by_kind(self.robustness, "hyrl"), self.settings, self.robustness
         samples = [
             Sample(kind, *counts.get(kind, (0, 0)), False, s.episodes)
-            for kind in dict.fromkeys((*usual_kinds(self.task, self.robustness.eps), *counts))
+            for kind in dict.fromkeys(
+                (*usual_kinds(self.task, found.eps, found.everywhere), *counts)
+            )
         ]
         attacks = [c for c in self.robustness.attacks if c.controller == "hyrl"]
         won, total = next(((c.attacked - c.lost, c.attacked) for c in attacks), (0, 0))
@@ -343,7 +345,7 @@ class _Case:
             where = listed(self.task.chart.names)
             yield f"what the sensors do to {where} is within that bound: {self.task.sensor}"
         yield from self._shares() if self.robustness.deciding else self._counts()
-        yield from map(comparison_sentence, self.robustness.comparisons)
+        yield from (comparison_sentence(self.task, c) for c in self.robustness.comparisons)
         yield f"stage 1: the policy {self.arrivals}"
         for result in self.retraining.modes:
             yield f"stage 6: {mode_sentence(self.task, result)}"

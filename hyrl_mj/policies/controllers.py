@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.policies.functions import declares_memory
+from hyrl_mj.policies.functions import check_act, declares_memory
 from hyrl_mj.policies.mlp import MemoryPolicy, Policy
 
 
@@ -87,6 +87,7 @@ def as_controller(loop: Controller | Policy) -> Controller:
     """
     if not declares_memory(loop):
         if isinstance(loop, Policy):
+            check_act(loop)
             return PolicyController(loop)
         if callable(getattr(loop, "step", None)):
             return loop

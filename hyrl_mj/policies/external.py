@@ -11,7 +11,7 @@ from hyrl_mj.errors import BadArtifact, BadInput, check_seed, unknown
 from hyrl_mj.files import artifacts
 from hyrl_mj.policies import algorithms
 from hyrl_mj.policies.controllers import PolicyController, is_memory, memory_at_start
-from hyrl_mj.policies.functions import PythonAgent, declares_memory, from_callable
+from hyrl_mj.policies.functions import PythonAgent, check_act, declares_memory, from_callable
 from hyrl_mj.policies.memoryless import answers, check_memoryless
 from hyrl_mj.policies.mlp import (
     ACTIVATIONS,
@@ -97,6 +97,8 @@ class Agent:
 AnyPolicy = str | Path | Policy | PythonAgent
 # The statistics of `VecNormalize` in a run directory.
 STATISTICS = "vecnormalize.npz"
+# The files of an agent there, which saw what these statistics normalise; modes see plain observations.
+STORED = ("policy.safetensors", "policy.onnx")
 # The ends of the names of files of agents, which are never the name of an object.
 FILES = (".zip", ".onnx", ".safetensors")
 # Kinds of agents besides those that SB3 trains.
@@ -120,9 +122,9 @@ class ExternalAgent:
     def store(self, path: Path) -> None:
         """Writes the agent into a run directory; of a function, only its fingerprint."""
         if (mlp := network(self.policy)) is not None:
-            mlp.save(path / "policy.safetensors")
+            mlp.save(path / STORED[0])
         elif self.model:
-            with artifacts.replacing(path / "policy.onnx") as temporary:
+            with artifacts.replacing(path / STORED[1]) as temporary:
                 temporary.write_bytes(self.model)
         else:
             content = {"algorithm": FUNCTION, "sha256": self.agent.sha256}
@@ -197,7 +199,13 @@ def load_agent(
             agent that is no function of its observations.
         BadArtifact: a file that is no such agent, or one that does not fit the task.
     """
-    policy = _load(Path(path), task, activation, stochastic, seed, vecnormalize, n_stack)
+    path = Path(path)
+    if vecnormalize is None and path.name in STORED and path.with_name(STATISTICS).exists():
+        raise BadInput(
+            f"the agent of {path} saw normalised observations: give --vecnormalize "
+            f"{path.with_name(STATISTICS)}"
+        )
+    policy = _load(path, task, activation, stochastic, seed, vecnormalize, n_stack)
     check_memoryless(policy, task, f"the agent of {path}")
     return policy
 
@@ -267,6 +275,7 @@ def read_agent(
         return _network(policy, task)
     if declares_memory(policy) or not isinstance(policy, Policy):
         policy = from_callable(cast(PythonAgent, policy), task)
+    check_act(policy)
     function: Policy = policy
     agent = Agent(FUNCTION, "", _fingerprint(function, task))
     check_memoryless(function, task)
@@ -297,7 +306,7 @@ def reopen_agent(
         return external.policy
     if policy is not None:
         raise BadInput(f"{path} holds its own policy: open it without another one")
-    file = path / ("policy.onnx" if agent.algorithm == ONNX else "policy.safetensors")
+    file = path / STORED[agent.algorithm == ONNX]
     statistics = path / STATISTICS if agent.statistics else None
     stochastic, n_stack = agent.stochastic, agent.n_stack
     # It was tried when the run was made, and is in each closed loop.

@@ -1,7 +1,8 @@
 """Policies of Python code: functions of the observation, modules of torch, and agents with a memory."""
 
+import inspect
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Set
 from dataclasses import dataclass
 from typing import Any, Protocol, cast
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from hyrl_mj.errors import BadInput, brief
 from hyrl_mj.policies import sb3_metadata
-from hyrl_mj.policies.mlp import MemoryPolicy, ObservationPolicy
+from hyrl_mj.policies.mlp import MemoryPolicy, ObservationPolicy, Policy
 from hyrl_mj.tasks import Task, at_levels, get_task
 
 
@@ -179,10 +180,12 @@ class _Predicting:
     Attributes:
         model: the model, whose state is a tuple of arrays (layers, n, size).
         state: its state after one observation.
+        seen: as `_seen_by`.
     """
 
     model: Predicts
     state: tuple[np.ndarray, ...]
+    seen: Callable[[np.ndarray], Any]
 
     def start(self, n: int) -> np.ndarray:
         memory = np.zeros((n, 1 + sum(part.size for part in self.state)))
@@ -196,7 +199,7 @@ class _Predicting:
             for flat, part in zip(np.split(memory[:, 1:], ends, axis=1), self.state, strict=True)
         )
         actions, state = self.model.predict(
-            observation, state=state, episode_start=memory[:, 0] == 1, deterministic=True
+            self.seen(observation), state=state, episode_start=memory[:, 0] == 1, deterministic=True
         )
         flat = [np.moveaxis(part, 1, 0).reshape(n, -1) for part in state]
         return actions, np.hstack([np.zeros((n, 1)), *flat])
@@ -205,44 +208,94 @@ class _Predicting:
 def _predicting(model: Predicts, task: Task) -> FunctionPolicy | RememberingPolicy:
     """Returns a model with SB3's `predict` as a policy, which has a memory if the model has a state."""
     _check_model(model, task)
-    observation = np.zeros((1, len(task.observation_low)), dtype=np.float32)
+    observation, seen = np.zeros((1, len(task.observation_low)), np.float32), _seen_by(model, task)
     begins = np.ones(1, dtype=bool)
     try:
-        _, state = model.predict(observation, None, episode_start=begins, deterministic=True)
+        _, state = model.predict(seen(observation), None, episode_start=begins, deterministic=True)
     except Exception as error:  # a user's code can raise anything
         raise BadInput(f"predict() of {model!r:.80} raised {brief(error)}") from error
     if state is None:
-        return FunctionPolicy(task, lambda o: model.predict(o, deterministic=True)[0], "the model")
+        return FunctionPolicy(
+            task, lambda o: model.predict(seen(o), deterministic=True)[0], "the model"
+        )
     arrays = isinstance(state, tuple) and all(isinstance(part, np.ndarray) for part in state)
     if not arrays or not all(part.ndim == 3 and part.shape[1] == 1 for part in state):
         raise BadInput(
             f"predict() of {model!r:.80} gives a state {state!r:.80}: give a tuple of arrays of shape "
             "(layers, n, size), or an object with start(n) and act(memory, observation)"
         )
-    return RememberingPolicy(task, _Predicting(model, state), "the model")
+    return RememberingPolicy(task, _Predicting(model, state, seen), "the model")
+
+
+def _seen_by(model: Any, task: Task) -> Callable[[np.ndarray], Any]:
+    """Returns how a model sees observations (n, k): in the shape of its space, or as the parts of a Dict."""
+    space, parts = getattr(model, "observation_space", None), task.observation_parts
+    ends = np.cumsum([*parts.values()])[:-1]
+    if isinstance(spaces := getattr(space, "spaces", None), Mapping):
+        return lambda o: {
+            key: part.reshape(len(o), *spaces[key].shape)
+            for key, part in zip(parts, np.split(o, ends, axis=1), strict=True)
+        }
+    return lambda o: o.reshape(len(o), *(getattr(space, "shape", None) or o.shape[1:]))
 
 
 def _check_model(model: Any, task: Task) -> None:
     """Raises `BadInput` if an SB3 model was trained on other observations or inputs than those of a task."""
-    observations = getattr(getattr(model, "observation_space", None), "shape", None)
-    size = len(task.observation_low)
-    if observations and observations != (size,):
+    space = getattr(model, "observation_space", None)
+    spaces, k, parts = getattr(space, "spaces", None), len(task.observation_low), {}
+    if isinstance(spaces, Mapping):
+        ours = parts = dict(task.observation_parts)
+    else:
+        spaces, ours = {"": space}, {"": k}
+    sizes = {key: np.prod(getattr(one, "shape", None) or -1) for key, one in spaces.items()}
+    if space is not None and sizes != ours:
+        observes = getattr(space, "shape", None) or space
         raise BadInput(
-            f"the model observes {observations}, and {task.name} gives ({size},): train it on that, or give "
-            "a function that makes its observations"
+            f"the model observes {observes}, and {task.name} gives {parts or f'({k},)'}: train it on that, "
+            "or give a function that makes its observations"
         )
     sb3_metadata.check_model(model, task)
-    space: Any = getattr(model, "action_space", None)
+    if "action_masks" in _arguments(getattr(model, "predict", None)):
+        raise BadInput(
+            f"the model chooses among the actions that a mask allows, and {task.name} has no masks: if each "
+            "action is allowed everywhere, give lambda o: model.predict(o, deterministic=True)[0]"
+        )
+    actions: Any = getattr(model, "action_space", None)
     levels = task.input_levels
-    if levels is not None and getattr(space, "n", len(levels)) != len(levels):
-        raise BadInput(f"the model has {space.n} actions, and {task.name} {len(levels)} levels")
-    if levels is None and hasattr(space, "low"):
-        given, own = np.stack([space.low, space.high]), np.stack(task.input_limits)
+    if actions is None:
+        return
+    shape, n = (getattr(actions, name, None) for name in ("shape", "n"))
+    if levels is not None and (shape, n) != ((), len(levels)):
+        raise BadInput(
+            f"the model's actions are {actions}, and {task.name} takes one of {len(levels)} levels: train it "
+            "on them, or give a function that chooses among them"
+        )
+    if levels is None:
+        own = np.stack(task.input_limits)
+        given = np.stack([actions.low, actions.high]) if hasattr(actions, "low") else np.zeros(0)
         if given.shape != own.shape or not np.allclose(given, own):
             raise BadInput(
-                f"the model's actions lie between {space.low} and {space.high}, and inputs of {task.name} "
-                f"between {own[0]} and {own[1]}: give a function that scales them"
+                f"the model's actions are {actions}, and inputs of {task.name} lie between {own[0]} and "
+                f"{own[1]}: give a function that scales them"
             )
+
+
+def _arguments(function: Any) -> Set[str]:
+    """Returns the names of the arguments of a function, none of what tells none."""
+    try:
+        return inspect.signature(function).parameters.keys()
+    except (TypeError, ValueError):
+        return set()
+
+
+def check_act(policy: Policy) -> None:
+    """Raises `BadInput` if `act` of a user's policy tells by its argument that it takes observations."""
+    first = next(iter(_arguments(policy.act)), "")
+    if first.startswith("obs"):
+        raise BadInput(
+            f"act({first}) of {policy!r:.60} takes observations, and a policy is asked about measurements, "
+            "act(measured): give hyrl_mj.from_callable(agent.act, task)"
+        )
 
 
 def declares_memory(agent: object) -> bool:
@@ -260,8 +313,8 @@ def from_callable(function: PythonAgent, task: Task) -> FunctionPolicy | Remembe
             the numbers of the levels, (n,) integers, or preferences (n, levels). Or a `torch.nn.Module` that
             does so with tensors, which is put into evaluation mode. Or an `AgentWithMemory`: an object with
             `start(n)`, which returns the memory (n, ...) of a robot at rest, and `act(memory, observation)`,
-            which returns such inputs and the next memory. Or a model with SB3's `predict`, also one with a
-            state, such as RecurrentPPO.
+            which returns such inputs and the next memory. Or a model with SB3's `predict`, or its policy,
+            also one with a state, such as RecurrentPPO.
         task: the robot and its problem.
 
     Raises:
@@ -274,6 +327,12 @@ def from_callable(function: PythonAgent, task: Task) -> FunctionPolicy | Remembe
         policy.start(1)
         return policy
     if _is_module(function):
+        # A policy of SB3 is a module, whose forward() draws, or does not scale to the limits of the inputs.
+        sb3 = {"state", "episode_start", "deterministic"}
+        if sb3 <= _arguments(getattr(function, "predict", None)):
+            return _predicting(cast(Predicts, function), task)
+        if _last_part(function) == "Tanh":
+            check_scaled(task, "the module")
         return FunctionPolicy(task, _of_arrays(function), "the module")
     if callable(function):
         return FunctionPolicy(task, function)
@@ -289,6 +348,23 @@ def _is_module(function: object) -> bool:
     """Returns whether an object is a `torch.nn.Module`; it is none if nobody has imported torch."""
     torch = sys.modules.get("torch")
     return torch is not None and isinstance(function, torch.nn.Module)
+
+
+def _last_part(module: Any) -> str:
+    """Returns the name of the last part of a `torch.nn.Sequential`, or of another module itself."""
+    while type(module).__name__ == "Sequential" and len(module):
+        module = module[-1]
+    return type(module).__name__
+
+
+def check_scaled(task: Task, name: str) -> None:
+    """Raises `BadInput` where a model that ends in Tanh has other inputs than a task."""
+    low, high = task.input_limits
+    if task.input_levels is None and not np.allclose([-low, high], 1):
+        raise BadInput(
+            f"{name} ends in Tanh, so that it gives numbers between -1 and 1, and inputs of {task.name} lie "
+            f"between {low} and {high}: let it scale them, as SB3's unscale_action does"
+        )
 
 
 def _of_arrays(module: Any) -> Callable[[np.ndarray], np.ndarray]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from hyrl_mj.errors import BadArtifact, BadInput
 from hyrl_mj.files import artifacts
-from hyrl_mj.policies.functions import FunctionPolicy
+from hyrl_mj.policies.functions import FunctionPolicy, check_scaled
 from hyrl_mj.policies.sb3_zip import REMEDY
 from hyrl_mj.system import limits
 from hyrl_mj.tasks import Task
@@ -40,7 +40,8 @@ def from_onnx(path: Path, task: Task, n_stack: int) -> FunctionPolicy:
         n = len(observation)
         # No other numbers of rows than were tried.
         rows = ROWS if found["batches"] and n > 1 else 1
-        whole = np.pad(observation, ((0, -n % rows), (0, 0)))
+        # An environment may observe float64.
+        whole = np.pad(observation.astype(np.float32), ((0, -n % rows), (0, 0)))
         parts = [whole[i : i + rows] for i in range(0, len(whole), rows)]
         outputs = [session.run([output_name], {input_name: part})[0] for part in parts]
         actions = np.concatenate(outputs)
@@ -49,6 +50,8 @@ def from_onnx(path: Path, task: Task, n_stack: int) -> FunctionPolicy:
 
     policy = FunctionPolicy(task, function, f"the model of {path}")
     try:
+        if found["squashed"]:
+            check_scaled(task, policy.name)
         policy.inputs(np.zeros((2, columns)))
     except BadInput as error:
         raise BadArtifact(str(error)) from error

@@ -79,6 +79,23 @@ def check(model: onnx.ModelProto) -> None:
         raise Refused("its numbers are in another file (external data): save it in one file")
 
 
+def _last_operator(graph: onnx.GraphProto) -> str:
+    """Returns the operator that gives the numbers of the first output, before it is only shaped or cast."""
+    nodes, name = (
+        {output: node for node in graph.node for output in node.output},
+        graph.output[0].name,
+    )
+    while (node := nodes.get(name)) and node.op_type in (
+        "Identity",
+        "Cast",
+        "Reshape",
+        "Squeeze",
+        "Flatten",
+    ):
+        name = node.input[0]
+    return node.op_type if node else ""
+
+
 def session_of(content: bytes) -> Any:
     """Returns onnxruntime's session of a model, on one thread."""
     options = onnxruntime.SessionOptions()
@@ -93,7 +110,7 @@ def examine(content: bytes, columns: int, rows: int, task: str) -> dict[str, Any
     Raises:
         Refused: it is not run, or it is no function of the observation.
     """
-    check(onnx.load_model_from_string(content))
+    check(model := onnx.load_model_from_string(content))
     session = session_of(content)
     inputs = session.get_inputs()
     outputs = [o.name for o in session.get_outputs()]
@@ -113,7 +130,8 @@ def examine(content: bytes, columns: int, rows: int, task: str) -> dict[str, Any
             f"the model takes {batch} observations at a time: export it for any number of them, or for one"
         )
     _try(lambda o: session.run(outputs[:1], {name: o})[0], columns, rows, batch == 1)
-    return {"input": name, "output": outputs[0], "batches": batch != 1}
+    squashed = _last_operator(model.graph) == "Tanh"
+    return {"input": name, "output": outputs[0], "batches": batch != 1, "squashed": squashed}
 
 
 def _try(answer: Any, columns: int, rows: int, one: bool) -> None:

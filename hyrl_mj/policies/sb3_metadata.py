@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import base64
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -33,6 +33,11 @@ def check_inputs(about: Mapping[str, Any], task: Task) -> None:
     if not isinstance(space, dict):
         return
     levels, n = task.input_levels, _numbers(space, "n")
+    if levels is not None and ".Discrete'" not in str(space.get(":type:", ".Discrete'")):
+        raise BadArtifact(
+            f"its actions are not numbers of {len(levels)} levels, as {task.name} takes them, but "
+            f"{space[':type:']!s:.80}: train it on those, or give a function that chooses among them"
+        )
     if n is not None and levels is not None and n.tolist() != [len(levels)]:
         raise BadArtifact(
             f"it chooses among {n[0]:g} levels, {task.name} has {len(levels)}: train it for these"
@@ -88,7 +93,11 @@ def check_observations(about: Mapping[str, Any], task: Task, on_policy: bool, n_
                 "it was trained on normalised observations (VecNormalize): its last one is "
                 f"{_row(_joined(last))}, where {task.name} gave {_row(_joined(original))}; {HOW}"
             )
-    _check_wrappers(about, last, possible)
+    space = about.get("observation_space")
+    limits = [_numbers(space, end) if isinstance(space, dict) else None for end in ("low", "high")]
+    dtype = space.get("dtype") if isinstance(space, dict) else None
+    if sign := _wrapped(limits, dtype, last, possible):
+        raise BadArtifact(f"{sign}; {HOW}")
     if normalized is None:
         raise BadArtifact(
             "nothing in it tells whether it was trained on normalised observations (VecNormalize), as "
@@ -123,24 +132,34 @@ def check_model(model: Any, task: Task) -> None:
             f"or whether that normalised rewards alone, if anything: load it {how}, as load(path, env=env), "
             'or give its zip with vecnormalize="none" if it saw plain ones'
         )
+    space = getattr(model, "observation_space", None)
+    ends = [getattr(space, end, None) for end in ("low", "high")]
+    limits = [None if end is None else np.ravel(end) for end in ends]
+    signs = limits, getattr(space, "dtype", None), _observations(last, task), _Possible(task)
+    if getattr(model, "num_timesteps", 0) and (sign := _wrapped(*signs)):
+        raise BadInput(
+            f"the model would be asked about plain observations, and {sign}; give an object that does as its "
+            "wrapper did and asks the model"
+        )
 
 
 # Observations (n, size) by the part of a Dict; those of a vector as "".
 _Parts = dict[str, np.ndarray]
 
 
-def _check_wrappers(about: Mapping[str, Any], last: _Parts | None, possible: _Possible) -> None:
-    """Raises `BadArtifact` if an agent saw observations that the task does not give.
+def _wrapped(
+    limits: Sequence[np.ndarray | None], dtype: Any, last: _Parts | None, possible: _Possible
+) -> str:
+    """Returns by what an agent shows that it saw observations that the task does not give, "" if by nothing.
 
     So it is with `NormalizeObservation` and other wrappers inside of the environment of the training.
+    `limits`, (k,) each, and `dtype` are those of the space of its observations, if they are known.
     """
     task, joined = possible.task, None if last is None else _joined(last)
     given = None if joined is None else possible.include(joined)
     if given:
-        return
-    which, types = "", {str(part.dtype) for part in (last or {}).values()}
-    space = about.get("observation_space")
-    limits = [_numbers(space, end) if isinstance(space, dict) else None for end in ("low", "high")]
+        return ""
+    which, types = "", {str(part.dtype) for part in (last or {}).values()} or {str(dtype)}
     ours = possible.limits
     if joined is not None and given is False:
         which = f"its last one is {_row(joined)}, which {task.name} never gives"
@@ -150,11 +169,11 @@ def _check_wrappers(about: Mapping[str, Any], last: _Parts | None, possible: _Po
         low, high = np.array(limits)
         if not np.allclose([low, high], ours, rtol=1e-4, atol=1e-4):
             which = f"they lie in {_box(low, high)}, those of {task.name} in {_box(*ours)}"
-    if which:
-        raise BadArtifact(
-            "it was trained on normalised observations (VecNormalize), or on others under a wrapper such as "
-            f"NormalizeObservation: {which}; {HOW}"
-        )
+    how = (
+        "it was trained on normalised observations (VecNormalize), or on others under a wrapper such as "
+        "NormalizeObservation"
+    )
+    return f"{how}: {which}" if which else ""
 
 
 def _normalized(

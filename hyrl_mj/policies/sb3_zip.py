@@ -38,6 +38,13 @@ def from_zip(
     with artifacts.reading(path, REMEDY):
         tensors, about = _read(path)
         _check_plain(tensors, about, task)
+        shape = _entry(about, "observation_space", "_shape")
+        if preprocessing.n_stack > 1 and len(re.findall(r"\d+", shape)) > 1:
+            raise BadArtifact(
+                f"it saw observations of shape {shape}, as FrameStackObservation gives, which begins with "
+                "copies of the first one where VecFrameStack begins with zeros: put that wrapper into the "
+                "environment, or give an object with the methods start and act in Python"
+            )
         algorithm = infer_algorithm(tensors, about)
         _check_used(tensors, algorithm)
         known = ALGORITHMS[algorithm]
@@ -117,6 +124,11 @@ def _check_plain(tensors: Mapping[str, np.ndarray], about: Mapping[str, Any], ta
     own = _entry(about, "policy_class", "__module__")
     if own and not own.startswith(("stable_baselines3.", "sb3_contrib.")):
         raise BadArtifact(f"its policy is of a class of its own, of {own:.80}: {PLAIN}")
+    if ".maskable." in own:
+        raise BadArtifact(
+            f"it chooses among the actions that a mask allows (MaskablePPO), and {task.name} has no masks: "
+            "if each action is allowed everywhere, give a function that calls model.predict in Python"
+        )
     if "actor.log_std" in tensors or np.ndim(tensors.get("log_std", 0)) == 2:
         raise BadArtifact("it was trained with use_sde: train it without, or export it to .onnx")
 

@@ -102,7 +102,7 @@ class Row:
             state="done",
             sentence=verdict.sentence,
             verdict=verdict.word,
-            figures=_figures(run.robustness),
+            figures=_figures(run.robustness, run.task.abilities.arrival_ends),
         )
 
     def stopped(self, sentence: str) -> Row:
@@ -271,14 +271,14 @@ def finished_run(path: Path) -> Run | None:
     return run if done else None
 
 
-def _figures(robustness: Robustness) -> dict[str, float | None]:
-    """Returns the results of a run by name."""
+def _figures(robustness: Robustness, timed: bool = True) -> dict[str, float | None]:
+    """Returns the results of a run by name; `timed` tells whether its episodes end where they arrive."""
     if (game := robustness.deciding) is None:
         found: dict[str, float] = {}
         for who in ("policy", "hyrl"):
             for kind, (arrived, episodes) in by_kind(robustness, who).items():
                 found |= {f"{who}_reached_{kind}": arrived / episodes, f"episodes_{kind}": episodes}
-        return {**found, **_compared(robustness)}
+        return {**found, **_compared(robustness, timed)}
     last = game.scores["hyrl"][-1]
     figures: dict[str, float | None] = {"open": last.open, "winnable": last.winnable}
     for i, when in ((0, "_without_noise"), (-1, "")):
@@ -296,10 +296,10 @@ def _figures(robustness: Robustness) -> dict[str, float | None]:
     for who, margin in game.margin.items():
         figures[f"{who}_margin"] = margin
         figures[f"{who}_miss_without_noise"] = game.miss_without_noise[who]
-    return {**figures, **_compared(robustness)}
+    return {**figures, **_compared(robustness, timed)}
 
 
-def _compared(robustness: Robustness) -> dict[str, float]:
+def _compared(robustness: Robustness, timed: bool = True) -> dict[str, float]:
     """Returns what comparisons from the same starts tell of both controllers, of the worst kind of noise."""
     figures: dict[str, float] = {}
     for compared in robustness.comparisons:
@@ -314,7 +314,7 @@ def _compared(robustness: Robustness) -> dict[str, float]:
         for who in compared.lost:
             if attack:
                 figures[f"{who}_withstood_attack"] = 1 - compared.lost[who] / n
-            if n == compared.lost[who]:  # none arrives, late or not
+            if n == compared.lost[who] or not timed:  # none arrives, late or not
                 continue
             for name, value in (
                 ("late", compared.late[who] / n),

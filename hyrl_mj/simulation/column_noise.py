@@ -216,9 +216,10 @@ def _correlated(
         return []
     steps = np.abs(np.diff(left))
     fast = np.nanquantile(steps[used[1:] & used[:-1]], 0.95) / dt
+    better = f"drift {bound:.3g} rate {fast:.3g}" if correlation > 0 else f"alternating {bound:.3g}"
     return [
         f"what is left of {name} is correlated from sample to sample ({correlation:.2f}): "
-        f"drift {bound:.3g} rate {fast:.3g} describes it better"
+        f"{better} describes it better"
     ]
 
 

@@ -318,7 +318,8 @@ class Noise:
         task.check_noise(self.bound, self.everywhere)
         if self.everywhere and self.kind == SENSOR:
             raise BadInput("a sensor tells where it acts: leave all coordinates out")
-        shares = np.ones(len(task.noisy)) if self.everywhere else np.array(task.noisy, dtype=float)
+        noisy = task.noisy_everywhere().noisy if self.everywhere else task.noisy
+        shares = np.array(noisy, dtype=float)
         return made(self.kind, self.bound, shares, {}, task, controller)
 
 

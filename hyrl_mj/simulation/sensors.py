@@ -468,11 +468,11 @@ def covers_sensor(task: Task, bound: float) -> bool:
     return bool((reach <= task.noise_in_chart(bound) + 1 / DECIMALS).all())
 
 
-def usual_kinds(task: Task, bound: float) -> tuple[str, ...]:
+def usual_kinds(task: Task, bound: float, everywhere: bool = False) -> tuple[str, ...]:
     """Returns the kinds of noise by which controllers of a task are judged under noise of a bound.
 
     Where samples take long, an adversary that looks ahead takes too long; an attack is there. What the task's
-    own sensor does is one of them if the bound covers it.
+    own sensor does is one of them if the bound covers it, and noise does not act on all columns.
     """
     kinds = KINDS if task.effort.looks_ahead else KINDS[:-1]
-    return (*kinds, SENSOR) if covers_sensor(task, bound) else kinds
+    return (*kinds, SENSOR) if not everywhere and covers_sensor(task, bound) else kinds
