@@ -11,7 +11,7 @@ import copy
 from collections import deque
 from collections.abc import Callable, Iterator
 from functools import partial
-from itertools import chain, product
+from itertools import chain
 from typing import Any
 
 import mujoco
@@ -37,7 +37,7 @@ from hyrl_mj.gym_import.uses import held, numbers_of
 # Samples of a run from the start of a reset, which is compared with one that is put there.
 NATURAL = 100
 # Lines of Python that a reset may take in a trial: one that draws until something holds may never end.
-LINES = 1_000_000
+LINES = 100_000
 # By how much equality constraints and limits of tendons may be violated more than after resets [m, rad].
 VIOLATED = 1e-3
 
@@ -389,8 +389,8 @@ class _Leading:
 def _naturals(spec: EnvironmentSpec, resets: Resets) -> Iterator[Instance]:
     """Yields new instances whose own resets lead to other places.
 
-    These are drawn, or the home that resets go by (as `init_qpos`, or a keyframe) is moved to places on the
-    chart, and moved back after the reset.
+    These are drawn, or the home that resets go by (as `init_qpos`, a keyframe, or a variable of the class) is
+    moved to places on the chart, and moved back after the reset.
     """
     if np.ptp(spec.z(resets.states), axis=0).any() and "goal" not in spec.found:
         for seed in range(1, 1 + EPISODES // 2):
@@ -400,11 +400,13 @@ def _naturals(spec: EnvironmentSpec, resets: Resets) -> Iterator[Instance]:
     starts = _starts(spec, np.random.default_rng(12))[: EPISODES // 2]
     places = spec.places[[c.kind == "qpos" for c in spec.coordinates]]
     probe = Instance(spec)
-    for name, state in product(_homes(probe), starts):
-        by = state[places] - spec.state[places]
-        if not _resets_moved(probe, name, by):
-            continue
-        if np.allclose(probe.physics.read()[places], state[places], rtol=SAME, atol=SAME):
+    for name in _homes(probe) if len(places) else ():
+        for state in starts:
+            by = state[places] - spec.state[places]
+            if not _resets_moved(probe, name, by):
+                continue
+            if not np.allclose(probe.physics.read()[places], state[places], rtol=SAME, atol=SAME):
+                break  # it leads to no other places
             natural = Instance(spec)
             _resets_moved(natural, name, by)
             yield natural
