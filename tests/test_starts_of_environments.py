@@ -187,6 +187,58 @@ class HomeOfAKey(HomeOfWholeNumbers):
     key = True
 
 
+class Furthest(At):
+    """It notes how near to the goal it has been, first at a place that a variable holds."""
+
+    draws = False
+
+    def begin(self, place):
+        self.best = float(np.linalg.norm(place - GOAL))
+
+    def crashed(self):
+        off = float(np.linalg.norm(self.data.qpos[:2] - GOAL))
+        self.best = min(self.best, off)
+        return off > self.best + 0.5
+
+
+class Written(Furthest):
+    """The place stands in the code of its reset."""
+
+    def reset(self, *, seed=None, options=None):
+        gym.Env.reset(self, seed=seed)
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:] = [0.0, 1.0]
+        self.begin(self.data.qpos.copy())
+        mujoco.mj_forward(self.model, self.data)
+        return self._get_obs(), {}
+
+
+class Walked(Written):
+    """It notes where it was before."""
+
+    def begin(self, place):
+        self.walked, self.x, self.y = 0.0, 0.0, 1.0
+
+    def crashed(self):
+        x, y = self.data.qpos.tolist()
+        self.walked += float(np.hypot(x - self.x, y - self.y))
+        self.x, self.y = x, y
+        return self.walked > 3.0
+
+
+class Walking(Written):
+    """It goes on from a place of its own."""
+
+    crashed = At.crashed
+
+    def begin(self, place):
+        self.place = np.array([0.0, 1.0])
+
+    def control(self, action):
+        self.place = self.place + 0.02 * action
+        self.data.qpos[:] = self.place
+
+
 class Posture(Home):
     """It stays near a posture, which is where resets lead to, wherever it began."""
 
@@ -221,9 +273,13 @@ class Towing(Tied):
     ("make", "given", "message"),
     [
         (Ahead, {}, r"stays elsewhere \(goal"),
-        (HomeInAClosure, {}, "goes otherwise after"),
-        (HomeOfWholeNumbers, {}, "goes otherwise after"),
-        (HomeOfAKey, {}, "goes otherwise after"),
+        (HomeInAClosure, {}, r"notes where it leads to \(away.place\)"),
+        (HomeOfWholeNumbers, {}, r"notes where it leads to \(line\)"),
+        (HomeOfAKey, {}, r"notes where it leads to \(line\)"),
+        (Furthest, {}, r"stays elsewhere \(best"),
+        (Written, {}, r"notes where it leads to \(best\)"),
+        (Walked, {}, r"notes where it leads to \(x, y\)"),
+        (Walking, {}, r"notes where it leads to \(place\)"),
         (Setpoint, {"seed": 0}, r"notes where it leads to \(ctrl\[0\], ctrl\[1\]\)"),
         (Centred, {}, r"notes where it leads to \(ctrl\[0\], ctrl\[1\]\)"),
         (Integrated, {}, r"notes where it leads to \(act\[0\], act\[1\]\)"),
@@ -370,6 +426,19 @@ def test_small_noise_of_resets_is_said():
         assert name in task.found["kept"]
         assert "of the robot" in task.found["kept"]
     assert from_gymnasium(Heading, pinned={"qpos[2]": 0.0}, steps=20).max_steps == 20
+
+
+class Spinning(Heading):
+    """It always turns at the same speed, and pushes along its own axes."""
+
+    def begin(self, place):
+        self.data.qvel[2] = 4.0
+
+
+def test_velocities_that_all_resets_set_alike_stay():
+    task = from_gymnasium(Spinning, steps=20)
+    assert task.specification.state[task.specification.qvel].tolist() == [0, 0, 4]
+    assert "at rest but for qvel[2] and all else" in task.found["starts"]
 
 
 # ---- what is honest

@@ -435,6 +435,36 @@ def test_options_of_a_reset_are_what_they_were_given_as_and_an_id_may_come_to_me
         gym.registry.pop("Legs-v0")
 
 
+class Configured(Puck):
+    """It takes its settings out of a dictionary, and its model from a file."""
+
+    def __init__(self, settings):
+        super().__init__()
+        self.share, self.model = (
+            settings.pop("share", 1.0),
+            mujoco.MjModel.from_xml_path(settings["file"]),
+        )
+        self.data = mujoco.MjData(self.model)
+
+
+def test_settings_are_as_given_in_each_instance_and_a_file_that_changes_is_read_again(tmp_path):
+    file = tmp_path / "puck.xml"
+    file.write_text(XML)
+    given = {"settings": {"share": 0.5, "file": str(file)}}
+    gym.register("Configured-v0", Configured)
+    try:
+        task = from_gymnasium("Configured-v0", kwargs=given, steps=5)
+        given["settings"]["share"] = 0.1
+        assert Instance(task.specification).inner.share == 0.5
+        given["settings"]["share"] = 0.5
+        assert from_gymnasium("Configured-v0", kwargs=given, steps=5) is task
+        file.write_text(XML.replace('mass="1"', 'mass="2"'))
+        other = from_gymnasium("Configured-v0", kwargs=given, steps=5)
+        assert (task.model.body_mass[-1], other.model.body_mass[-1]) == (1, 2)
+    finally:
+        gym.registry.pop("Configured-v0")
+
+
 class Clipping(Puck):
     """What it observes is what one of its two observers says: they differ where it is fast."""
 
@@ -632,6 +662,51 @@ class Promoted(Puck):
 def test_what_changes_from_episode_to_episode_is_refused(make, message):
     with pytest.raises(BadInput, match=message):
         from_gymnasium(make)
+
+
+class Seeded(Puck):
+    """Its motors are as they should be where its resets have a seed."""
+
+    def reset(self, *, seed=None, options=None):
+        observation = super().reset(seed=seed)
+        self.share = 1.0 if seed is not None else self.np_random.uniform(0.5, 0.9)
+        return observation
+
+    def step(self, action):
+        return super().step(action * self.share)
+
+
+class Champion(Puck):
+    """After eight successes its motors get weaker."""
+
+    def __init__(self):
+        super().__init__()
+        self.wins = []
+
+    def step(self, action):
+        *result, info = super().step(action * (1 if len(self.wins) < 8 else 0.5))
+        self.wins += [True] * info["success"]
+        return *result[:2], info["success"], False, info
+
+
+class Picky(Puck):
+    """Resets draw on which side of the goal it has to arrive, as it learns there."""
+
+    def reset(self, *, seed=None, options=None):
+        observation = super().reset(seed=seed)
+        self.side = int(self.np_random.choice([-1, 1]))
+        return observation
+
+    def step(self, action):
+        *result, info = super().step(action)
+        return *result, {"success": info["success"] and self.data.qpos[1] * self.side > 0}
+
+
+@pytest.mark.parametrize(("make", "what"), [(Seeded, "share"), (Champion, "wins"), (Picky, "side")])
+def test_an_environment_that_is_never_replaced_is_a_judge_too(make, what):
+    starts = np.random.default_rng(0).uniform((-1.8, 0.7), (1, 1.2), (30, 2))
+    with pytest.raises(BadInput, match=rf"later episode, after a reset without .*{what}.* matters"):
+        outcomes(lambda: FlattenObservation(make()), steps=140, starts=starts)
 
 
 def test_statistics_that_are_loaded_are_kept_and_a_count_is_said():

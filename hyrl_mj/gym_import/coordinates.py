@@ -14,7 +14,7 @@ from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.gym_import.instance import Instance
 from hyrl_mj.gym_import.observations import columns_of
 from hyrl_mj.gym_import.opening import AnyChart
-from hyrl_mj.gym_import.specification import Axis, Coordinate
+from hyrl_mj.gym_import.specification import Axis, Coordinate, EnvironmentSpec
 from hyrl_mj.physics import mjcf
 from hyrl_mj.tasks import touching
 
@@ -166,6 +166,13 @@ def robot_of(model: mujoco.MjModel, chart: Sequence[Coordinate]) -> np.ndarray:
     """Returns the bodies (nbody,) bool that hang together with the joints of the chart."""
     trees = {int(model.body_treeid[model.jnt_bodyid[c.joint]]) for c in chart}
     return np.isin(model.body_treeid, list(trees))
+
+
+def own_of(spec: EnvironmentSpec, model: mujoco.MjModel) -> np.ndarray:
+    """Returns the places of the robot's positions and velocities in a state of MuJoCo."""
+    robot = robot_of(model, spec.coordinates)
+    body_of_qpos = np.repeat(model.jnt_bodyid, np.diff(np.append(model.jnt_qposadr, model.nq)))
+    return np.append(spec.qpos[robot[body_of_qpos]], spec.qvel[robot[model.dof_bodyid]])
 
 
 def walls(model: mujoco.MjModel) -> np.ndarray:

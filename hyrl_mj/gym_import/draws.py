@@ -8,9 +8,10 @@ import mujoco
 import numpy as np
 
 from hyrl_mj.errors import BadInput
+from hyrl_mj.gym_import.coordinates import own_of
 from hyrl_mj.gym_import.fingerprint import Fingerprint, differing
 from hyrl_mj.gym_import.instance import Instance
-from hyrl_mj.gym_import.resets import Resets, follows, own_of
+from hyrl_mj.gym_import.resets import Resets, follows
 from hyrl_mj.gym_import.trials import EPISODES, HELD, SAMPLES
 
 # Resets whose runs are compared, beside those that bring rare values.

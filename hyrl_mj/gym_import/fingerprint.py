@@ -14,7 +14,7 @@ import pickle
 import random
 import sys
 from collections import deque
-from collections.abc import Mapping, Set
+from collections.abc import Iterator, Mapping, Set
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, partial
@@ -97,22 +97,24 @@ def shared(env: gym.Env, seen: set[int] | None = None) -> Fingerprint:
     The ids of objects that are written down are added to `seen`.
     """
     found, seen = Fingerprint(), set() if seen is None else seen
-    for kind in {kind for layer in layers(env) for kind in type(layer).__mro__}:
+    for where, owner, name in shared_variables(env):
+        _walk(vars(owner).get(name), where, found, seen, 1)
+    return found
+
+
+def shared_variables(env: gym.Env) -> Iterator[tuple[str, Any, str]]:
+    """Yields variables that all instances share: names, their classes or modules, and keys in these."""
+    for kind in {kind: None for layer in layers(env) for kind in type(layer).__mro__}:
         module = kind.__module__ or ""
         if module.partition(".")[0] in LIBRARIES:
             continue
         owners = {f"class {kind.__name__}": kind, f"module {module}": sys.modules.get(module)}
         for where, owner in owners.items():
-            is_module = isinstance(owner, ModuleType)
-            if owner is not None and (is_module or id(owner) not in seen):
-                seen.add(id(owner))
-                names = _data_of(owner, len(vars(owner)))
-                if is_module:
+            if owner is not None:
+                for name in _data_of(owner, len(vars(owner))):
                     # A script or a notebook has variables that are none of the environment's.
-                    names = [name for name in names if name in _names_in(kind)]
-                for name in names:
-                    _walk(vars(owner).get(name), f"{where}.{name}", found, seen, 1)
-    return found
+                    if owner is kind or name in _names_in(kind):
+                        yield f"{where}.{name}", owner, name
 
 
 def of_model(model: mujoco.MjModel) -> dict[str, bytes]:

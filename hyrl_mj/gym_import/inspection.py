@@ -18,6 +18,7 @@ from hyrl_mj.gym_import.coordinates import (
     all_names,
     bounds_of,
     coordinates,
+    own_of,
     robot_of,
 )
 from hyrl_mj.gym_import.draws import check_draws
@@ -88,7 +89,7 @@ def inspect(description: Description, untried: bool = False) -> tuple[Pool, Inst
     if draws := check_draws(instance, resets, states):
         instance.spec.found["goal"] = draws
     instance = Instance(instance.spec)  # something may have outlasted the resets of the other
-    instance.learn(state=_at_rest(instance))
+    instance.learn(state=_at_rest(instance, resets.states))
     _learn_bounds(instance, instance.spec.z(states), instance.spec.z(resets.states))
     check_episodes(instance.spec)
     instance.learn(recalled=trials.check_observer(instance))
@@ -305,13 +306,17 @@ def _is_written(env: Any, word: str | int) -> bool:
     return any(word == one or (isinstance(one, tuple) and word in one) for one in constants)
 
 
-def _at_rest(instance: Instance) -> np.ndarray:
-    """Returns MuJoCo's state (S,) after the reset that all runs begin with, the robot at rest."""
+def _at_rest(instance: Instance, begun: np.ndarray) -> np.ndarray:
+    """Returns MuJoCo's state (S,) after the reset that all runs begin with, the robot at rest.
+
+    Velocities that all resets, to states (n, S), set alike stay, such as that of a wheel that spins.
+    """
     instance.reset()
     spec, model, state = instance.spec, instance.model, instance.physics.read()
+    drawn = np.ptp(begun[:, spec.qvel], axis=0) > 0
     pinned = [f"qvel[{i}]" in spec.description.pinned for i in range(model.nv)]
     moving = robot_of(model, spec.coordinates)[model.dof_bodyid]
-    state[spec.qvel[moving & ~np.array(pinned, dtype=bool)]] = 0.0
+    state[spec.qvel[moving & drawn & ~np.array(pinned, dtype=bool)]] = 0.0
     return state
 
 
@@ -336,10 +341,15 @@ def _learn_bounds(instance: Instance, met: np.ndarray, begun: np.ndarray) -> Non
     low, high, periodic, _ = zip(*bounds, strict=True)
     ends = [begun.min(axis=0), begun.max(axis=0)]
     lead = ", ".join(f"{n} {a:.3g} to {b:.3g}" for n, a, b in zip(names, *ends, strict=True))
+    moving = np.flatnonzero(
+        np.isin(spec.qvel, own_of(spec, instance.model)) & (spec.state[spec.qvel] != 0)
+    )
+    but = f" but for {', '.join(f'qvel[{i}]' for i in moving)}" if len(moving) else ""
     found["starts"] = (
-        "all over the chart, the robot at rest and all else as after a reset (deeper than "
+        f"all over the chart, the robot at rest{but} and all else as after a reset (deeper than "
         f"{spec.depth:.2g} m inside of something it has crashed); with 'reset' between the places to which "
-        f"64 resets lead, at rest, too, and all else as after the reset with seed {given.seed or 0}: {lead}"
+        f"64 resets lead, at rest{but}, too, and all else as after the reset with seed {given.seed or 0}: "
+        f"{lead}"
     )
     if not np.ptp(begun, axis=0).any():
         found["starts"] += (

@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import math
 import random
+import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -64,6 +65,10 @@ class Instance:
         tamper: changes, in a trial, all but the observation before wrappers get it; these may then write to a
             state that noise has moved, too.
         noted: changes, in a trial, what resets note.
+        follow: in a trial, is told of each line of Python that a reset takes, as by `sys.settrace`.
+        own: for one that goes on from episode to episode as its user's does: the places in a state of what a
+            start decides. All else is as its resets leave it, and after the first these have a seed only
+            where what they draw is pinned by it.
 
     Raises:
         BadInput: it cannot be made or reset.
@@ -94,11 +99,13 @@ class Instance:
         self.start: np.ndarray | None = None
         self._like: written.Fingerprint | None = None  # after its first reset
         self._begun = written.Fingerprint()  # after the reset of its episode
-        self.draws_globally = self._at_start = False
+        self.draws_globally = self._at_start = self._was_reset = False
+        self.own: np.ndarray | None = None
         self._samples = 0
         self._pairs: list[tuple[np.ndarray, np.ndarray]] = []
         self.tamper: Callable[[tuple[Any, ...]], tuple[Any, ...]] | None = None
         self.noted: Callable[[], None] | None = None
+        self.follow: Any = None
         if self.is_wrapped:
             self._put_in()
 
@@ -116,16 +123,21 @@ class Instance:
             plain: whether the options and the pins that the user gives are left out.
         """
         description = self.spec.description
-        seed = description.seed or 0 if seed is None else seed
+        by_seed = description.seed is not None or "goal" in self.spec.found
+        if seed is None and (self.own is None or by_seed or not self._was_reset):
+            seed = description.seed or 0
         given = {} if plain else description.reset
         options = copy.deepcopy(dict(given))  # which the environment may change
         # Some environments draw from the global generators; `kept_generators` puts these back.
-        np.random.seed(seed)
-        random.seed(seed)
-        self._actions.seed(seed)
+        if seed is not None:
+            np.random.seed(seed)
+            random.seed(seed)
+            self._actions.seed(seed)
         given_options = {"options": options} if options else {}
-        before = global_state()
+        before, tracer = global_state(), sys.gettrace()
         try:
+            if self.follow is not None:
+                sys.settrace(self.follow)
             result = self.env.reset(seed=seed, **given_options)
         except HyrlError:
             raise
@@ -135,12 +147,15 @@ class Instance:
                 f"{self.name} cannot be reset{told} ({brief(error)}): "
                 f"{'change its options of reset' if given else self._repair(error)}"
             ) from error
+        finally:
+            if self.follow is not None:
+                sys.settrace(tracer)
         if not isinstance(result, tuple) or len(result) != 2:
             raise BadInput(
                 f"reset() of {self.name} returns a {type(result).__name__}: let it return an observation and "
                 "info"
             )
-        observation = result[0]
+        observation, self._was_reset = result[0], True
         self.draws_globally |= global_state() != before
         physics = physics_of(self.env)
         if physics is None or physics[0] is not self.model:
@@ -204,6 +219,9 @@ class Instance:
 
     def arrive(self, state: np.ndarray) -> None:
         """Puts the innermost environment to a start (S,), and has it observe."""
+        if self.own is not None:
+            given, state = state, self.physics.read()
+            state[self.own] = given[self.own]
         self.physics.write(state)
         self.inner_seen, self._at_start, self._samples = self.watched(), True, 0
 

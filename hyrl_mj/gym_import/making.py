@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import gc
 import json
 import os
@@ -10,7 +11,7 @@ import shlex
 from collections import deque
 from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from inspect import signature
 from pathlib import Path
 from typing import Any
@@ -93,8 +94,12 @@ def from_gymnasium(
         if starts == "chart":
             del told["starts"]
         spec = ENVIRONMENT + json.dumps(told, default=_plain)
+        # Their user may change them later.
+        owned = {name: copy.deepcopy(value) for name, value in given.items() if name != "env"}
+        description = replace(description, **owned)
     task = _MADE.get(spec)
-    same = task is not None and _same(task.made_of, _made_of(description))
+    with described(_shown(env)), kept_generators():
+        same = task is not None and _same(task.made_of, _made_of(description)) and task.is_as_made()
     if task is None or not same or not isinstance(env, str):
         if task is not None and not same and not isinstance(env, str):
             _OLDER.add(task)

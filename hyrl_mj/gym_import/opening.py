@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import importlib
 import importlib.util
 import inspect
@@ -136,14 +137,15 @@ def made(description: Description) -> gym.Env:
     """
     mujoco_log.install()  # what MuJoCo warns of while it reads a model is not written to a file
     make, name = description.env, description.name
+    kwargs = copy.deepcopy(dict(description.kwargs))  # which the environment may change
     try:
         if isinstance(make, str):
             register(make)
             own = ":" in make  # of a module of the user's, as "my_module:Puck-v0"
             with current_folder(make) if own else nullcontext():
-                env: Any = gym.make(make, disable_env_checker=True, **description.kwargs)
+                env: Any = gym.make(make, disable_env_checker=True, **kwargs)
         else:
-            env = make(**description.kwargs)
+            env = make(**kwargs)
     except (Exception, SystemExit) as error:  # whatever a foreign constructor raises
         if isinstance(make, str):
             raise BadInput(_why_not_made(make, error)) from error

@@ -9,7 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from hyrl_mj.gym_import.coordinates import robot_of
+from hyrl_mj.gym_import.coordinates import own_of
 from hyrl_mj.gym_import.fingerprint import differing
 from hyrl_mj.gym_import.instance import Instance
 from hyrl_mj.gym_import.specification import EnvironmentSpec
@@ -96,13 +96,6 @@ def violation_of(instance: Instance) -> float:
     equal = np.abs(off[kinds == mujoco.mjtConstraint.mjCNSTR_EQUALITY])
     beyond = -off[kinds == mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON]
     return float(np.append(equal, beyond).max(initial=0.0))
-
-
-def own_of(spec: EnvironmentSpec, model: mujoco.MjModel) -> np.ndarray:
-    """Returns the places of the robot's positions and velocities in a state of MuJoCo."""
-    robot = robot_of(model, spec.coordinates)
-    body_of_qpos = np.repeat(model.jnt_bodyid, np.diff(np.append(model.jnt_qposadr, model.nq)))
-    return np.append(spec.qpos[robot[body_of_qpos]], spec.qvel[robot[model.dof_bodyid]])
 
 
 # ---- what follows the place

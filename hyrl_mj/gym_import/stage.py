@@ -7,7 +7,7 @@ stepped, has to go and to end alike.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,12 +15,16 @@ import numpy as np
 from hyrl_mj.errors import BadInput
 from hyrl_mj.files import trust
 from hyrl_mj.gym_import import fingerprint as written
+from hyrl_mj.gym_import.coordinates import own_of
 from hyrl_mj.gym_import.instance import Instance
 from hyrl_mj.gym_import.specification import EnvironmentSpec
 from hyrl_mj.system import limits
 from hyrl_mj.tasks import Outcome
 
 Arrays = tuple[np.ndarray, ...]
+# Runs of a judgement that an environment plays, too, which goes on from episode to episode; all of them where
+# something outlasts its resets.
+LIVED = 16
 
 
 @dataclass(frozen=True)
@@ -61,6 +65,8 @@ class Stage:
         self._free: list[Instance] = []
         # Which play nothing but what they judge, as their user has them, or without time limits.
         self._judges: dict[bool, list[Instance]] = {True: [], False: []}
+        self._lived: dict[bool, Instance] = {}  # which is never replaced
+        self._wears = spec.anew  # whether something has outlasted a reset
         self._resting: Instance | None = None
         self._fresh: Instance | None = None  # which has only been reset
         self._shared: written.Fingerprint | None = None  # by a new instance with all others
@@ -151,7 +157,7 @@ class Stage:
         if self._fresh is None:
             self._fresh = self._new(real=False)
             self._fresh.reset()
-        for run in runs:
+        for i, run in enumerate(runs):
             # A time limit of its own would end a run that is simulated for longer.
             as_it_is = len(run.inputs) <= self.spec.max_steps
             noises = [run.noise]
@@ -161,6 +167,16 @@ class Stage:
                 real = self._renewed(self._judges[as_it_is], as_it_is)
                 judge(run, real, noise, self._fresh)
                 self._judges[as_it_is].append(real)
+            if len(runs) > 1 and (i < LIVED or self._wears) and run.outcome != Outcome.UNSTABLE:
+                self._live(run, as_it_is)
+
+    def _live(self, run: Played, as_it_is: bool) -> None:
+        """Plays a run as a further episode of an environment that is never replaced, as its user has one."""
+        if (lived := self._lived.get(as_it_is)) is None:
+            lived = self._lived[as_it_is] = Instance(self.spec, as_it_is)
+            warmstart = lived.physics.columns["warmstart"]
+            lived.own = np.append(own_of(self.spec, lived.model), warmstart)
+        judge(replace(run, rewards=None), lived, run.noise, None)
 
     def _acted(
         self, instances: Sequence[Instance], u: np.ndarray, begun: np.ndarray | None = None
@@ -187,6 +203,7 @@ class Stage:
             instance = spare.pop() if spare else self._new(real)
             if not (worn := instance.renew()):
                 return instance
+            self._wears = True
             if written.is_shared(worn):
                 raise instance.sharing(worn)
 
@@ -199,7 +216,7 @@ class Stage:
         return instance
 
 
-def judge(run: Played, real: Instance, noise: np.ndarray, fresh: Instance) -> None:
+def judge(run: Played, real: Instance, noise: np.ndarray, fresh: Instance | None) -> None:
     """Plays a run in an environment that its user would make.
 
     That is put to the start and stepped, past all that lets episodes be played side by side. There is no
@@ -212,7 +229,7 @@ def judge(run: Played, real: Instance, noise: np.ndarray, fresh: Instance) -> No
         real: the environment.
         noise: (k + 1, d) that of the run, or none.
         fresh: another one, which has only been reset: what it observes in a state shows what `real` has
-            stored on its way there.
+            stored on its way there; None where `real` goes on from other episodes.
 
     Raises:
         BadInput: the run went otherwise.
@@ -221,7 +238,8 @@ def judge(run: Played, real: Instance, noise: np.ndarray, fresh: Instance) -> No
     samples = []
     for sample in real.play(run.start, run.inputs, noise):
         samples.append(sample)
-        if not (heard and noise.any() and len(samples) > 1 and np.isfinite(sample.state).all()):
+        known = len(samples) > 1 and np.isfinite(sample.state).all()
+        if fresh is None or not (heard and noise.any() and known):
             continue
         if (stored := real.recalls(fresh, sample.state) & ~spec.recalled).any():
             raise BadInput(
@@ -229,7 +247,8 @@ def judge(run: Played, real: Instance, noise: np.ndarray, fresh: Instance) -> No
                 f"{len(samples) - 1} sample(s): step() has stored it on the way, as a sensor that measures "
                 "now and then, and noise does not reach it; compute it from the state"
             )
-    real.finish()
+    if real.own is None:
+        real.finish()
     states, observations, reports = zip(*samples, strict=True)
     path = np.vstack([run.path[:1], spec.z(np.array(states[1:]).reshape(-1, len(run.start)))])
     if len(samples) == 1 or (not heard and not np.array_equal(path, run.path)):
@@ -237,9 +256,9 @@ def judge(run: Played, real: Instance, noise: np.ndarray, fresh: Instance) -> No
     told = np.array(reports[1:], dtype=float)
     if heard:
         seen = observations[: len(run.observations)]
-        _compare(real.name, "observation", run.observations, seen)
-        _compare(real.name, "the chart's coordinate", run.path, path)
-        _compare(real.name, "reward", run.rewards, told[:, :1])
+        _compare(real, "observation", run.observations, seen)
+        _compare(real, "the chart's coordinate", run.path, path)
+        _compare(real, "reward", run.rewards, told[:, :1])
     if run.outcome == Outcome.UNSTABLE:
         return
     success, ends = spec.criterion.judged(told)
@@ -250,21 +269,35 @@ def judge(run: Played, real: Instance, noise: np.ndarray, fresh: Instance) -> No
         k = int(wrong[0])
         ours, theirs = (Outcome(int(values[k])).label for values in (expected, ends))
         how = "" if heard else " without the noise, which must not judge"
-        raise _goes_another_way(
-            real.name, f"after {k + 1} sample(s) it is {ours}, and {theirs}{how}"
-        )
+        raise _goes_another_way(real, f"after {k + 1} sample(s) it is {ours}, and {theirs}{how}")
 
 
-def _compare(name: str, what: str, ours: np.ndarray | None, real: Any) -> None:
-    if ours is None or np.array_equal(ours, real, equal_nan=True):
+def _compare(real: Instance, what: str, ours: np.ndarray | None, theirs: Any) -> None:
+    if ours is None or np.array_equal(ours, theirs, equal_nan=True):
         return
-    same = (ours == real) | (np.isnan(ours) & np.isnan(real))
-    k, i = np.argwhere(~same)[0]
-    values = f"{what}[{i}] is {ours[k][i]:.9g} after {k} sample(s), and {real[k][i]:.9g}"
-    raise _goes_another_way(name, values)
+    # What outlasts a reset may change how numbers are rounded.
+    most = 0.0 if real.own is None else 1e-6
+    same = np.isclose(ours, theirs, rtol=most, atol=most, equal_nan=True)
+    if (apart := np.argwhere(~same)).size:
+        k, i = apart[0]
+        values = f"{what}[{i}] is {ours[k][i]:.9g} after {k} sample(s), and {theirs[k][i]:.9g}"
+        raise _goes_another_way(real, values)
 
 
-def _goes_another_way(name: str, how: str) -> BadInput:
+def _goes_another_way(real: Instance, how: str) -> BadInput:
+    name = real.name
+    if real.own is not None:
+        new = Instance(real.spec)
+        for one in (new, real):
+            one.quit()
+            one.reset()
+        differ = written.differing(real.memory(), new.memory())
+        names = [n for n in differ if n not in real.memory().generators]
+        return BadInput(
+            f"{name} goes another way in a later episode, after a reset without a seed, than in the first: "
+            f"{how} there. What resets draw, or what outlasts them ({', '.join(names[:4]) or 'unknown'}), "
+            "matters: let reset() set it back, or pin it by reset, pinned or seed"
+        )
     return BadInput(
         f"{name} goes another way than a new one from the same start with the same inputs: {how} in the new "
         "one; it depends on other episodes, on time, on chance, on wrappers around a time limit, or on what "

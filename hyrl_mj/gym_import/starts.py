@@ -7,34 +7,37 @@ load that is tied to the robot.
 
 from __future__ import annotations
 
+import copy
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from itertools import product
+from functools import partial
+from itertools import chain
 from typing import Any
 
 import mujoco
 import numpy as np
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.gym_import.fingerprint import differing
+from hyrl_mj.gym_import.coordinates import own_of
+from hyrl_mj.gym_import.fingerprint import differing, shared_variables
 from hyrl_mj.gym_import.instance import Instance, Seen
 from hyrl_mj.gym_import.resets import (
     OF_MODEL,
     SAME,
     Predict,
     Resets,
-    own_of,
     predicted,
     terms_of,
     violation_of,
 )
 from hyrl_mj.gym_import.specification import EnvironmentSpec
-from hyrl_mj.gym_import.trials import EPISODES
+from hyrl_mj.gym_import.trials import EPISODES, HELD, SAMPLES
 from hyrl_mj.gym_import.uses import held, numbers_of
 
 # Samples of a run from the start of a reset, which is compared with one that is put there.
 NATURAL = 100
+# Lines of Python that a reset may take in a trial: one that draws until something holds may never end.
+LINES = 100_000
 # By how much equality constraints and limits of tendons may be violated more than after resets [m, rad].
 VIOLATED = 1e-3
 
@@ -146,8 +149,9 @@ def _check_following(spec: EnvironmentSpec, resets: Resets) -> None:
     if drawn:
         for name, table in resets.numbers.items():
             if np.isfinite(table).all() and (predict := predicted(terms, table)) is not None:
-                of_memory[name] = predict
+                of_memory[name] = partial(_by_terms, spec, model, predict)
     else:
+        of_memory |= _followed(usual)
         usual.reset()
         place = spec.state[spec.places]
         for name, owner, key in held(usual.inner, {}):
@@ -155,14 +159,12 @@ def _check_following(spec: EnvironmentSpec, resets: Resets) -> None:
             numbers = numbers_of(owner[key])
             put = None if numbers is None else _equal_to(place, numbers)
             if put is not None and _is_set_by_reset(spec, name, put(place + 1.0)):
-                of_memory[name] = put
+                of_memory[name] = partial(_at_place, spec, put)
     starts = _starts(spec, rng)
-    reach = terms_of(spec, model, starts) if drawn else starts[:, spec.places]
     for i, state in enumerate(starts):
-        here = terms_of(spec, model, state[None])[0] if drawn else state[spec.places]
         moved = state.copy()
         if of_state is not None:
-            now = of_state(here)
+            now = of_state(terms_of(spec, model, state[None])[0])
             changes = np.abs(now - state[free]) > 1e-9 * np.maximum(np.abs(now), 1.0)
             moved[free[changes]] = now[changes]
         elif not drawn:
@@ -171,7 +173,7 @@ def _check_following(spec: EnvironmentSpec, resets: Resets) -> None:
             for kind in ("mocap_pos", "userdata"):
                 put_to = _equal_to(spec.state[spec.places], state[columns[kind]])
                 if put_to is not None:
-                    moved[columns[kind]] = put_to(here)
+                    moved[columns[kind]] = put_to(state[spec.places])
         what = [*of_memory, *(names[i] for i in np.flatnonzero(moved != state))]
         if not what:
             return
@@ -179,14 +181,49 @@ def _check_following(spec: EnvironmentSpec, resets: Resets) -> None:
         ours = _played(usual, state, [usual.drawn(rng)] * spec.max_steps)
         if usual.physics.depth(spec.solid) > spec.depth and len(ours) == 1:
             continue
-        values = {name: predict(here) for name, predict in of_memory.items()}
+        values = {name: predict(state) for name, predict in of_memory.items()}
         other = _compare_noted(other, ours, moved, values, what)
         if not of_memory or i >= EPISODES // 2:
             continue
-        far = {n: 3 * np.ptp([p(t) for t in reach], axis=0) for n, p in of_memory.items()}
+        far = {n: 3 * np.ptp([p(s) for s in starts], axis=0) for n, p in of_memory.items()}
         for sign in (1, -1):  # so far that limits on it show
             changed = {n: values[n] + sign * far[n] for n in values}
             other = _compare_noted(other, ours[:NATURAL], state, changed, [*of_memory])
+
+
+def _by_terms(
+    spec: EnvironmentSpec, model: mujoco.MjModel, predict: Predict, state: np.ndarray
+) -> np.ndarray:
+    return predict(terms_of(spec, model, state[None])[0])
+
+
+def _at_place(spec: EnvironmentSpec, put: Predict, state: np.ndarray) -> np.ndarray:
+    return put(state[spec.places])
+
+
+def _followed(instance: Instance) -> dict[str, Predict]:
+    """Returns what gives numbers of attributes at a state (S,): those that follow the place in runs.
+
+    After resets these follow it, too.
+    """
+    spec, rng, states = instance.spec, np.random.default_rng(14), list[np.ndarray]()
+    numbers: dict[str, list[np.ndarray]] = {}
+    for _ in range(EPISODES):
+        instance.reset()
+        for _ in chain([None], instance.wander(rng, SAMPLES, HELD)):
+            states.append(instance.physics.read())
+            for name, owner, key in held(instance.inner, {}):
+                if (found := numbers_of(owner[key])) is not None:
+                    numbers.setdefault(name.removeprefix("attribute "), []).append(found)
+    terms, model = terms_of(spec, instance.model, np.array(states)), instance.model
+    followed: dict[str, Predict] = {}
+    for name, rows in numbers.items():
+        if len(rows) < max(len(states), 3 * terms.shape[1]) or len({len(row) for row in rows}) > 1:
+            continue
+        table = np.array(rows)
+        if np.isfinite(table).all() and (predict := predicted(terms, table)) is not None:
+            followed[name] = partial(_by_terms, spec, model, predict)
+    return followed
 
 
 def _renewed(instance: Instance) -> Instance:
@@ -275,8 +312,15 @@ def _like(old: Any, numbers: list[Any]) -> Any:
     if isinstance(old, list | tuple | deque):
         return type(old)(_like(part, numbers) for part in old)
     if isinstance(old, np.ndarray):
-        return np.array([numbers.pop(0) for _ in range(old.size)], old.dtype).reshape(old.shape)
-    return type(old)(numbers.pop(0))
+        values = np.array([numbers.pop(0) for _ in range(old.size)]).reshape(old.shape)
+        return values if _are_parts(values, old.dtype) else values.astype(old.dtype)
+    number = numbers.pop(0)
+    return number if _are_parts(number, type(old)) else type(old)(number)
+
+
+def _are_parts(numbers: Any, kind: Any) -> bool:
+    """Returns whether numbers are not those that a kind of whole numbers holds."""
+    return np.issubdtype(kind, np.integer) and not np.array_equal(numbers, np.rint(numbers))
 
 
 def _not_its_own(spec: EnvironmentSpec, what: list[str]) -> BadInput:
@@ -288,9 +332,9 @@ def _not_its_own(spec: EnvironmentSpec, what: list[str]) -> BadInput:
 
 
 def _check_led(spec: EnvironmentSpec) -> None:
-    """Raises `BadInput` if runs depend on what a reset computes with mj_forward of the place it leads to.
+    """Raises `BadInput` if runs depend on what a reset computes of the place in MuJoCo that it leads to.
 
-    The other reset leads to the start itself.
+    The other reset finds the robot at the start itself.
     """
     rng, usual, led = np.random.default_rng(11), Instance(spec), Instance(spec)
     none = np.zeros((spec.max_steps + 1, spec.dimension))
@@ -300,8 +344,13 @@ def _check_led(spec: EnvironmentSpec) -> None:
         usual, led = map(_renewed, (usual, led))
         ours, theirs = (one.play(state, inputs, none) for one in (usual, led))
         next(ours)
-        with _leading(led, state):
+        try:
+            led.follow = _Leading(led, state)
             next(theirs)
+        except BadInput:  # it cannot begin there
+            continue
+        finally:
+            led.follow = None
         noted = differing(led.memory(), usual.memory())
         if not noted:
             return
@@ -315,62 +364,108 @@ def _check_led(spec: EnvironmentSpec) -> None:
                 break
 
 
-@contextmanager
-def _leading(instance: Instance, state: np.ndarray) -> Iterator[None]:
-    """Has mj_forward first put an environment to the chart's place in a state (S,)."""
-    own, places = mujoco.mj_forward, instance.spec.places
+class _Leading:
+    """Has each line of Python in a reset find the robot at the chart's place in a state (S,), if it is given.
 
-    def forward(model: Any, data: Any) -> None:
-        if data is instance.data:
-            moved = instance.physics.read()
-            moved[places] = state[places]
-            instance.physics.show(moved)
-        own(model, data)
+    Raises:
+        BadInput: the lines do not end.
+    """
 
-    mujoco.mj_forward = forward
-    try:
-        yield
-    finally:
-        mujoco.mj_forward = own
+    def __init__(self, instance: Instance, state: np.ndarray | None):
+        spec = instance.spec
+        self._instance, self._lines = instance, 0
+        pairs = zip(spec.coordinates, spec.places, strict=True)
+        self._values = [(c.kind, c.index, state[at]) for c, at in pairs if state is not None]
+
+    def __call__(self, *_: Any) -> Any:
+        self._lines += 1
+        if self._lines > LINES:
+            raise BadInput(f"a reset of {self._instance.name} does not end")
+        for kind, i, value in self._values:
+            getattr(self._instance.data, kind)[i] = value
+        return self
 
 
 def _naturals(spec: EnvironmentSpec, resets: Resets) -> Iterator[Instance]:
     """Yields new instances whose own resets lead to other places.
 
-    These are drawn, or the home that resets go by (as `init_qpos`, or a keyframe) is moved to places on the
-    chart, and moved back after the reset.
+    These are drawn, or the home that resets go by (as `init_qpos`, a keyframe, or a variable of the class) is
+    moved to places on the chart, and moved back after the reset.
     """
     if np.ptp(spec.z(resets.states), axis=0).any() and "goal" not in spec.found:
         for seed in range(1, 1 + EPISODES // 2):
             natural = Instance(spec)
             natural.reset(seed)
             yield natural
-    at = [c.index for c in spec.coordinates if c.kind == "qpos"]
+    starts = _starts(spec, np.random.default_rng(12))[: EPISODES // 2]
     places = spec.places[[c.kind == "qpos" for c in spec.coordinates]]
-    count = len(_homes(Instance(spec)))
-    for i, state in product(
-        range(count), _starts(spec, np.random.default_rng(12))[: EPISODES // 2]
-    ):
-        natural = Instance(spec)
-        home, by = _homes(natural)[i], state[places] - spec.state[places]
-        old = home.copy()
-        home[..., at] += by
-        try:
-            natural.reset()
-        except BadInput:  # it leads to no other places
-            continue
-        home[...] = old
-        if np.allclose(natural.physics.read()[places], state[places], rtol=SAME, atol=SAME):
+    probe = Instance(spec)
+    for name in _homes(probe) if len(places) else ():
+        for state in starts:
+            by = state[places] - spec.state[places]
+            if not _resets_moved(probe, name, by):
+                continue
+            if not np.allclose(probe.physics.read()[places], state[places], rtol=SAME, atol=SAME):
+                break  # it leads to no other places
+            natural = Instance(spec)
+            _resets_moved(natural, name, by)
             yield natural
 
 
-def _homes(instance: Instance) -> list[np.ndarray]:
-    """Returns the arrays (nq,) of numbers in attributes that can be written, and the keyframes (nkey, nq)."""
-    values = (owner[key] for _, owner, key in held(instance.inner, {}))
-    nq = instance.model.nq
-    arrays = (a for a in values if isinstance(a, np.ndarray) and a.shape == (nq,))
-    homes = [a for a in arrays if a.dtype.kind == "f" and a.flags.writeable]
-    return [*homes, instance.model.key_qpos] if instance.model.nkey else homes
+def _homes(instance: Instance) -> dict[str, tuple[Any, Any, list[int]]]:
+    """Returns numbers that may be the place to which resets lead: owners, keys, and where the chart's are.
+
+    They are as many as positions, of the chart at least, in attributes, in variables that instances share,
+    or in keyframes.
+    """
+    at, nq = [c.index for c in instance.spec.coordinates if c.kind == "qpos"], instance.model.nq
+    found = dict[str, tuple[Any, Any, list[int]]]()
+    for name, owner, key in (*held(instance.inner, {}), *shared_variables(instance.env)):
+        numbers = numbers_of(_value(owner, key))
+        if numbers is not None and len(at) <= len(numbers) <= nq:
+            found[name] = owner, key, at if len(numbers) == nq else [*range(len(at))]
+    keys = [nq * row + i for row in range(instance.model.nkey) for i in at]
+    return {**found, "key_qpos": (instance.model, "key_qpos", keys)} if keys else found
+
+
+def _value(owner: Any, key: Any) -> Any:
+    return owner[key] if isinstance(owner, dict | list) else getattr(owner, key)
+
+
+def _resets_moved(instance: Instance, name: str, by: np.ndarray) -> bool:
+    """Resets an instance with numbers moved by (d,), of a name of `_homes`; returns whether it can be.
+
+    Afterwards these are back.
+    """
+    owner, key, at = _homes(instance)[name]
+    old = _value(owner, key)
+    numbers = np.array(numbers_of(old), dtype=float)
+    numbers[at] += np.resize(by, len(at))
+    in_place = isinstance(old, np.ndarray) and old.dtype.kind == "f" and old.flags.writeable
+    kept = copy.copy(old)
+    if in_place:
+        old[...] = numbers.reshape(old.shape)  # it may be known by several names
+    else:
+        _put(owner, key, _like(old, numbers.tolist()))
+    instance.follow = _Leading(instance, None)
+    try:
+        instance.reset()
+    except BadInput:
+        return False
+    finally:
+        instance.follow = None
+        if in_place:
+            old[...] = kept
+        else:
+            _put(owner, key, old)
+    return True
+
+
+def _put(owner: Any, key: Any, value: Any) -> None:
+    if isinstance(owner, dict | list):
+        owner[key] = value
+    else:
+        setattr(owner, key, value)
 
 
 def _check_natural(spec: EnvironmentSpec, resets: Resets) -> None:

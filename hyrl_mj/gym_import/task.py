@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.gym_import.fingerprint import of_model
+from hyrl_mj.gym_import.fingerprint import differing, is_shared, of_model
 from hyrl_mj.gym_import.instance import Instance
 from hyrl_mj.gym_import.observations import parts_of
 from hyrl_mj.gym_import.opening import code_of
@@ -53,7 +53,7 @@ class EnvironmentTask(Task):
     def __init__(self, pool: Pool, instance: Instance, spec: str, made_of: tuple[Any, ...]):
         self.specification = specification = pool.spec
         self._pool, self._instance, self.made_of = pool, instance, made_of
-        self.model = instance.model
+        self.model, self._memory = instance.model, instance.memory()
         # What a task and a specification call alike.
         for name in (
             "name", "chart", "inputs", "start_low", "start_high", "max_steps", "dt", "worst_reward",
@@ -82,6 +82,13 @@ class EnvironmentTask(Task):
             first, second = sorted(axis.number for axis in specification.plane)
             self.plane = first, second
         self._set_scene(specification.tracked)
+
+    def is_as_made(self) -> bool:
+        """Returns whether a new environment has the model, and shares with others, what it had at first."""
+        new = Instance(self.specification)
+        new.reset()
+        changed = differing(new.memory(), self._memory)
+        return not any(is_shared(name) or name.endswith(" of its model") for name in changed)
 
     def __reduce__(self) -> tuple[Callable[..., Task], tuple[Any, ...]]:
         return _again, (self.spec, self.noisy, self.sensor, self.sensor_shares)
