@@ -15,7 +15,7 @@ from hyrl_mj.tasks import Outcome, Task
 
 # Number of episodes from which arrivals are counted.
 EPISODES = 1_000
-# Number of them that are judged before, where a plant may not be what it seems.
+# Number of them that an environment's own judge plays before.
 JUDGED = 64
 
 
@@ -41,9 +41,7 @@ class Arrivals:
     def measure(task: Task, policy: Policy) -> Arrivals:
         """Counts the arrivals of a policy from starts of the task, which are the same each time."""
         starts = task.starts(EPISODES, np.random.default_rng(0))
-        if (
-            type(task).verify is not Task.verify
-        ):  # of some it is judged first whether they are what they seem
+        if type(task).verify is not Task.verify:  # an environment may not be what it seems
             simulate(task, policy, starts[:JUDGED])
         settings = LoopSettings(vary=True, label="arrivals")
         run = closed_loop(task, PolicyController(policy), starts, settings=settings)
