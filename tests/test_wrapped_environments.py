@@ -106,7 +106,9 @@ class ByReward(gym.Wrapper):
 class ByLastInfo(ByInfo):
     """Shows what it was told a sample before."""
 
-    told = -1.4
+    def reset(self, **options):
+        self.told = -1.4
+        return self.env.reset(**options)
 
     def step(self, action):
         observation, *rest = self.env.step(action)
@@ -230,7 +232,7 @@ class Steered(gym.Wrapper):
         return self.seen, info
 
     def step(self, action):
-        push = 2.4 * np.asarray(action) - self.seen[4:] - 0.3 * self.seen[:2]
+        push = 0.8 * np.clip(action, -3, 3) - self.seen[4:] - 0.3 * self.seen[:2]
         self.seen, reward, *ends, _ = self.env.step(np.clip(push, -4, 4))
         return self.seen, reward, *ends, {"success": bool(np.linalg.norm(self.seen[2:4]) < 0.25)}
 
