@@ -30,6 +30,7 @@ from environments import (
     puck_agent,
 )
 from gl import needs_gl
+from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 from manual import arguments_of_environments
 from planted import spare_environments, without_pdfs
@@ -415,6 +416,94 @@ def test_walls_that_nothing_collides_with_are_none():
 def test_wrong_arguments_are_refused_with_what_is_allowed(options, message):
     with pytest.raises(BadInput, match=message):
         from_gymnasium(Puck, **options)
+
+
+ARM = """
+<mujoco model="arm">
+  <worldbody>
+    <body name="tip">
+      <joint name="turn" axis="0 0 1" damping="0.5"/>
+      <geom type="capsule" fromto="0 0 0 0.5 0 0" size="0.03" contype="0" conaffinity="0"/>
+      <site name="tip" pos="0.5 0 0"/>
+    </body>
+    <site name="goal" pos="-0.5 0 0"/>
+  </worldbody>
+  <actuator><motor name="push" joint="turn" ctrlrange="-1 1"/></actuator>
+</mujoco>
+"""
+
+
+class Arm(gym.Env):
+    """An arm that turns freely, and begins near one angle."""
+
+    observation_space = spaces.Box(-np.inf, np.inf, (3,))
+    action_space = spaces.Box(-1.0, 1.0, (1,))
+    begins, limits = 4.7, ""
+
+    def __init__(self):
+        self.model = mujoco.MjModel.from_xml_string(
+            ARM.replace("damping", f"{self.limits} damping")
+        )
+        self.data = mujoco.MjData(self.model)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[0] = self.begins + self.np_random.uniform(-0.1, 0.1)
+        mujoco.mj_forward(self.model, self.data)
+        return self._get_obs(), {}
+
+    def _get_obs(self):
+        angle = self.data.qpos[0]
+        return np.array([np.cos(angle), np.sin(angle), self.data.qvel[0]])
+
+    def step(self, action):
+        self.data.ctrl[:] = action
+        mujoco.mj_step(self.model, self.data, nstep=5)
+        return (
+            self._get_obs(),
+            0.0,
+            False,
+            False,
+            {"success": bool(np.cos(self.data.qpos[0]) > 0.99)},
+        )
+
+
+class Stopped(Arm):
+    limits = 'range="-90 180"'
+    begins = 0.0
+
+
+@pytest.mark.parametrize(
+    ("env", "given", "message"),
+    [
+        (
+            Stopped,
+            {"bounds": {"turn": [-1.7, 1]}},
+            "reach beyond the range of its joint, -1.5708 to",
+        ),
+        (Arm, {"bounds": {"turn": [-180, 180]}}, "more than a turn"),
+        (
+            Stopped,
+            {"bounds": {"turn": [1, 2]}, "starts": "reset"},
+            "resets of .* lead to turn -0.0",
+        ),
+        (Stopped, {"success": "distance(tip, goal) <= 0.1"}, "several things .* have the name tip"),
+    ],
+)
+def test_charts_and_names_that_mean_something_else_are_refused(env, given, message):
+    with pytest.raises(BadInput, match=message):
+        from_gymnasium(env, steps=5, **given)
+
+
+def test_a_whole_turn_that_is_given_is_periodic_and_resets_may_lead_to_another_turn():
+    success = {"success": 'distance("body tip", goal) <= 0.1'}
+    task = from_gymnasium(
+        Arm, steps=5, starts="reset", bounds={"turn": [-3.1416, 3.1416]}, **success
+    )
+    assert task.chart.periodic == (True,)
+    assert task.specification.criterion.points[0][0][0] == "xpos"
+    assert -1.69 < task.start_low[0] < task.start_high[0] < -1.48
 
 
 def test_options_that_change_nothing_are_refused_with_what_is_drawn():

@@ -15,7 +15,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.sac.policies import SACPolicy
 from test_truer_environments import STARTS, flat, outcomes, pilot, plain
 
-from hyrl_mj import BadInput, from_callable, from_gymnasium, load_agent, simulate
+from hyrl_mj import BadInput, Noise, from_callable, from_gymnasium, load_agent, simulate
 from hyrl_mj.gym_export import BatchedEnv
 from hyrl_mj.gym_export.sb3_env import TaskVecEnv
 from hyrl_mj.tasks import check_task, trial
@@ -97,6 +97,46 @@ class ByAttribute(gym.Wrapper):
         return np.append(self.unwrapped.pose, observation[2:]), *rest
 
 
+class ByReward(gym.Wrapper):
+    def step(self, action):
+        observation, reward, *rest = self.env.step(action)
+        return np.append(reward, observation[1:]), reward, *rest
+
+
+class ByLastInfo(ByInfo):
+    """Shows what it was told a sample before."""
+
+    def reset(self, **options):
+        self.told = -1.4
+        return self.env.reset(**options)
+
+    def step(self, action):
+        observation, *rest = self.env.step(action)
+        before, self.told = self.told, rest[-1]["x"]
+        return np.append(before, observation[1:]), *rest
+
+
+class Zoned(Flat):
+    """Tells words and truths, which no small displacement changes."""
+
+    def step(self, action):
+        *found, info = super().step(action)
+        self.above = bool(self.data.qpos[1] > 0)
+        return *found, info | {"side": "left" if self.above else "right"}
+
+
+class ByWord(gym.Wrapper):
+    def step(self, action):
+        observation, *rest = self.env.step(action)
+        return np.append(rest[-1].get("side") == "left", observation[1:]), *rest
+
+
+class ByTruth(gym.Wrapper):
+    def step(self, action):
+        observation, *rest = self.env.step(action)
+        return np.append(self.unwrapped.above, observation[1:]), *rest
+
+
 class Usual(Flat):
     """Has attributes of any kind, an array for a reward, and None for `truncated`."""
 
@@ -115,10 +155,118 @@ def test_usual_habits_and_attributes_of_any_kind_are_taken():
     assert outcomes(lambda: DtypeObservation(Usual(), np.float64)) == plain()
 
 
-@pytest.mark.parametrize(("wrapper", "way"), [(ByInfo, "info x"), (ByAttribute, "attribute pose")])
-def test_wrappers_that_observe_the_place_past_the_noise_are_refused(wrapper, way):
+@pytest.mark.parametrize(
+    ("wrapper", "env", "way"),
+    [
+        (ByInfo, Telling, "info x"),
+        (ByAttribute, Telling, "attribute pose"),
+        (ByLastInfo, Telling, "info x"),
+        (ByReward, Flat, "the reward"),
+        (ByWord, Zoned, "info side"),
+        (ByTruth, Zoned, "attribute above"),
+    ],
+)
+def test_wrappers_that_observe_the_place_past_the_noise_are_refused(wrapper, env, way):
     with pytest.raises(BadInput, match=f"a wrapper of .* observes .*{way}.* does not reach"):
-        from_gymnasium(lambda: wrapper(Telling()))
+        from_gymnasium(lambda: wrapper(env()))
+
+
+class Before(gym.Wrapper):
+    """Shows where the robot was before the step."""
+
+    def step(self, action):
+        before = self.unwrapped.data.qpos.copy()
+        observation, *rest = self.env.step(action)
+        return np.append(before, observation[2:]), *rest
+
+
+class Fixes(gym.Wrapper):
+    """Reads the place once in some samples, and shows that in place of the velocity."""
+
+    every = 45
+
+    def reset(self, **options):
+        self.count, self.fix = 0, np.zeros(2)
+        return self.env.reset(**options)
+
+    def step(self, action):
+        observation, *rest = self.env.step(action)
+        self.count += 1
+        if self.count % self.every == 0:
+            self.fix = self.unwrapped.data.qpos.copy()
+        return np.append(observation[:4], self.fix), *rest
+
+
+class Seldomer(Fixes):
+    every = 230
+
+
+def test_what_wrappers_read_of_the_state_at_any_time_is_under_noise_or_refused():
+    with pytest.raises(BadInput, match="has read from MuJoCo's state before it stepped"):
+        from_gymnasium(lambda: Before(Flat()))
+    assert from_gymnasium(lambda: Fixes(Flat()), steps=60).specification.sensing == "now"
+    task = from_gymnasium(lambda: Seldomer(Flat()), steps=240)
+    assert not task.specification.sensing  # no trial is so long
+    agent = from_callable(lambda seen: np.zeros((len(seen), 2)), task)
+    noise = Noise("uniform", 0.1)
+    with pytest.raises(BadInput, match=r"has read from MuJoCo's state .* or reads seldom"):
+        simulate(task, agent, [-1.4, 0.5], noise)
+
+
+class Placed(gym.ObservationWrapper):
+    """Shows where the body is, which the environment computes a physics step before the end of a step."""
+
+    def observation(self, observation):
+        return np.append(self.unwrapped.data.body("puck").xpos[:2], observation[2:])
+
+
+def test_what_wrappers_read_lags_with_noise_as_without_it():
+    assert from_gymnasium(lambda: Placed(Flat())).specification.sensing == "earlier"
+
+
+class Steered(gym.Wrapper):
+    """Drives to setpoints by what it observes, and judges by that, too."""
+
+    def reset(self, **options):
+        self.seen, info = self.env.reset(**options)
+        return self.seen, info
+
+    def step(self, action):
+        push = 0.8 * np.clip(action, -3, 3) - self.seen[4:] - 0.3 * self.seen[:2]
+        self.seen, reward, *ends, _ = self.env.step(np.clip(push, -4, 4))
+        return self.seen, reward, *ends, {"success": bool(np.linalg.norm(self.seen[2:4]) < 0.25)}
+
+
+def test_a_wrapper_that_steers_and_judges_by_a_noisy_observation_is_refused():
+    with pytest.raises(BadInput, match="running without the noise, which must not judge"):
+        outcomes(lambda: Steered(Flat()), 0.2)
+
+
+class InPlace(gym.ObservationWrapper):
+    """Changes what it is given, as a list, or a dictionary of which it takes entries away."""
+
+    def observation(self, observation):
+        if isinstance(observation, dict):
+            place, to_goal = observation.pop("position"), observation.pop("to_goal")
+            return np.concatenate([place, to_goal, observation.pop("velocity")])
+        return observation[:2] + observation[2:]  # of arrays a sum
+
+
+class Listed(Flat):
+    def _get_obs(self):
+        return super()._get_obs().tolist()
+
+
+class Vector(InPlace):
+    def __init__(self, env):
+        super().__init__(env)
+        self.observation_space = NARROW
+
+
+@pytest.mark.parametrize("env", [Puck, Listed])
+def test_wrappers_get_what_the_environment_gives_and_may_change_it(env):
+    assert outcomes(lambda: Vector(env())) == plain()
+    assert outcomes(lambda: Vector(env()), 0.1) == outcomes(Flat, 0.1)
 
 
 class Late(Home):

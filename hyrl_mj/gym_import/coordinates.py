@@ -272,8 +272,7 @@ def bounds_of(
     found = []
     for i, (c, axis) in enumerate(zip(spec.coordinates, axes, strict=True)):
         if c.name in spec.description.bounds:
-            low, high = spec.description.bounds[c.name]
-            found.append(Bound(float(low), float(high), False, "given"))
+            found.append(_given(instance, c, begun))
         elif c.kind == "qpos" and model.jnt_limited[c.joint]:
             low, high = model.jnt_range[c.joint] + c.offset
             found.append(Bound(float(low), float(high), False, "the range of its joint"))
@@ -291,6 +290,34 @@ def bounds_of(
                 low, high, why = min(low, ends[0]), max(high, ends[1]), "sampled runs and walls"
             found.append(Bound(low, high, False, why))
     return found, islands, plane
+
+
+def _given(instance: Instance, c: Coordinate, begun: np.ndarray) -> Bound:
+    """Returns the bounds that a user gives for a coordinate; a whole turn is one of a periodic coordinate.
+
+    Raises:
+        BadInput: no run can be there, or each place is there several times.
+    """
+    spec, model = instance.spec, instance.model
+    low, high = map(float, spec.description.bounds[c.name])
+    bounds = f"bounds of {c.name} from {low:g} to {high:g} {c.unit}"
+    if c.kind == "qpos" and model.jnt_limited[c.joint]:
+        first, last = model.jnt_range[c.joint] + c.offset
+        if low < first - 1e-3 * (last - first) or high > last + 1e-3 * (last - first):
+            raise BadInput(
+                f"{bounds} reach beyond the range of its joint, {first:.6g} to {last:.6g} {c.unit}, where no "
+                "run stays: give bounds within"
+            )
+    turns = c.kind == "qpos" and c.axis is None and (high - low) / (2 * np.pi)
+    if turns > 0.99 and not model.jnt_limited[c.joint] and _turns_alike(instance, c, begun):
+        if turns > 1.01:
+            raise BadInput(
+                f"{bounds} are more than a turn, of which whole ones change nothing that is seen: give "
+                "at most one, in rad"
+            )
+        middle = (low + high) / 2
+        return Bound(middle - np.pi, middle + np.pi, True, "given, a whole turn")
+    return Bound(low, high, False, "given")
 
 
 def _extent(instance: Instance, geoms: Sequence[int], axis: Axis) -> tuple[float, float]:

@@ -295,6 +295,13 @@ def _criterion(instance: Instance, info: Sequence[str]) -> Criterion:
                 f"name an entry of info; {met}"
             )
     model = instance.model
+    for place in dict.fromkeys(name for pair in criterion.places for name in pair):
+        there = mjcf.points_of(model, place)
+        if any(np.ptp([getattr(instance.data, kind)[i] for kind, i in there], axis=0) > 1e-6):
+            raise BadInput(
+                f"several things of {name} have the name {place}, in different places: say which, as in "
+                f'distance("body {place}", ...), of site, body and geom'
+            )
     points = [(mjcf.point_of(model, a), mjcf.point_of(model, b)) for a, b in criterion.places]
     return replace(criterion, points=tuple(points))
 
@@ -339,6 +346,10 @@ def _learn_bounds(instance: Instance, met: np.ndarray, begun: np.ndarray) -> Non
         for name, b in zip(names, bounds, strict=True)
     )
     low, high, periodic, _ = zip(*bounds, strict=True)
+    chart = Chart(names, tuple(c.unit for c in spec.coordinates), low, high, periodic)
+    begun = chart.near(begun, begun[0])  # in one turn, which the middle of the chart is in
+    middle = (begun.min(axis=0) + begun.max(axis=0)) / 2
+    begun = begun + (chart.wrap(middle) - middle)
     ends = [begun.min(axis=0), begun.max(axis=0)]
     lead = ", ".join(f"{n} {a:.3g} to {b:.3g}" for n, a, b in zip(names, *ends, strict=True))
     moving = np.flatnonzero(
@@ -358,13 +369,19 @@ def _learn_bounds(instance: Instance, met: np.ndarray, begun: np.ndarray) -> Non
         )
     start_low, start_high = low, high
     if given.starts == "reset":
-        start_low, start_high = (tuple(np.clip(end, low, high).tolist()) for end in ends)
+        start_low, start_high = (tuple(end.tolist()) for end in ends)
+        out = ~np.array(periodic) & ((ends[0] < low) | (ends[1] > high))
+        if out.any():
+            raise BadInput(
+                f"resets of {instance.name} lead to {lead}, beyond the bounds of {names[out.argmax()]} that "
+                "are given: give bounds that hold them, or starts='chart'"
+            )
     max_steps = given.steps or instance.steps or 1_000  # of one that never ends by itself
     found["sample time"] = f"{spec.dt:g} s, of a step"
     if given.steps is None:
         found["steps"] = f"{max_steps} ({max_steps * spec.dt:g} s) of an episode"
     instance.learn(
-        chart=Chart(names, tuple(c.unit for c in spec.coordinates), low, high, periodic),
+        chart=chart,
         islands=islands,
         plane=plane,
         start_low=start_low,

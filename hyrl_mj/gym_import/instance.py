@@ -46,6 +46,10 @@ class Seen(NamedTuple):
     report: Sequence[float]
 
 
+# States, or chart points, with observations.
+Samples = Iterable[tuple[np.ndarray, np.ndarray]]
+
+
 class Instance:
     """An environment that plays episodes, one at a time.
 
@@ -69,6 +73,8 @@ class Instance:
         own: for one that goes on from episode to episode as its user's does: the places in a state of what a
             start decides. All else is as its resets leave it, and after the first these have a seed only
             where what they draw is pinned by it.
+        veiled: whether, in a trial, wrappers see MuJoCo's state where the last noise showed the robot
+            before they step the environment, too.
 
     Raises:
         BadInput: it cannot be made or reset.
@@ -106,6 +112,7 @@ class Instance:
         self.tamper: Callable[[tuple[Any, ...]], tuple[Any, ...]] | None = None
         self.noted: Callable[[], None] | None = None
         self.follow: Any = None
+        self.veiled, self._noise = False, np.empty(0)
         if self.is_wrapped:
             self._put_in()
 
@@ -281,6 +288,8 @@ class Instance:
         if self._thread is None:
             self.take(self.stepped(u))
         else:
+            if self.veiled and self._noise.any():
+                self._show(self._noise)
             self._ask(lambda: self.stepped(u))
 
     def sense(self, noise: np.ndarray | None = None) -> None:
@@ -385,10 +394,11 @@ class Instance:
         return bool(wrote.any())
 
     def _inner_step(self, action: Any) -> Any:
+        self._come_back()
         result = self._own_step(action)
         if self._resetting:
             return result
-        self.inner_seen = result[0]
+        self.inner_seen = copy.deepcopy(result[0])  # wrappers may change theirs in place
         return self._observed(result[0], result[1:])
 
     def _inner_reset(self, **options: Any) -> Any:
@@ -397,12 +407,12 @@ class Instance:
             result = self._own_reset(**options)
         finally:
             self._resetting = False
-        self.inner_seen = result[0]
+        self.inner_seen = copy.deepcopy(result[0])
         if self.start is None:
             return result
         self.pin()
         self.arrive(self.start)
-        return self._observed(self.inner_seen, result[1:])
+        return self._observed(copy.deepcopy(self.inner_seen), result[1:])
 
     def _observed(self, observation: Any, rest: tuple[Any, ...]) -> tuple[Any, ...]:
         """Returns what wrappers get of a step or a reset: in a sample, after its noise is known."""
@@ -421,12 +431,25 @@ class Instance:
         if noise is not None and noise.any():
             observation = self.displaced(noise)
             if self.spec.sensing:
-                # Wrappers that read MuJoCo's state for what they observe see it where the sensor does.
-                shown = self.moved(self.physics.read(), noise)
-                self.physics.leave()
-                self.physics.write(shown)
-                self._shown = self.physics.read()
+                self._show(noise)
+        self._noise = np.empty(0) if noise is None else noise
         return (observation, *rest)
+
+    def _show(self, noise: np.ndarray) -> None:
+        """Puts MuJoCo to where noise (d,) shows the robot, for wrappers that observe its state."""
+        state = self.physics.read()
+        self.physics.leave()
+        self._put_to(self.spec.sensing or "now", state, noise)
+        self._shown = self.physics.read()
+
+    def _put_to(self, derived: Derived, state: np.ndarray, noise: np.ndarray) -> None:
+        """Puts MuJoCo into a state (S,) under noise (d,), with derived quantities as `derived` says."""
+        moved = self.moved(state, noise)
+        if derived == "earlier":
+            self.physics.write(self.moved(self.physics.earlier(state), noise))
+            self.physics.show(moved)
+        else:
+            self.physics.write(moved)
 
     # ---- what it observes
 
@@ -479,13 +502,8 @@ class Instance:
 
     def seen_as(self, derived: Derived, state: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Returns the innermost observation (o,) of a state (S,) under noise (d,), as `derived` says."""
-        moved = self.moved(state, noise)
         self.physics.leave()
-        if derived == "earlier":
-            self.physics.write(self.moved(self.physics.earlier(state), noise))
-            self.physics.show(moved)
-        else:
-            self.physics.write(moved)
+        self._put_to(derived, state, noise)
         seen = flat(self.watched(), self.inner.observation_space)
         self.physics.come_back()
         return seen
@@ -601,3 +619,16 @@ class Instance:
             f"{self.name} draws random numbers in step() ({name}), so its state does not tell what comes "
             "next: make it without that noise"
         )
+
+
+def check_unveiled(name: str, ours: Samples, veiled: Samples) -> None:
+    """Raises `BadInput` if a run of an environment observes otherwise where the true state is veiled."""
+    for (state, seen), (other_state, other) in zip(ours, veiled, strict=False):
+        if not np.array_equal(state, other_state, equal_nan=True):
+            return  # a wrapper controls the robot by what it reads, or has written there
+        if not np.array_equal(seen, other, equal_nan=True):
+            raise BadInput(
+                f"a wrapper of {name} observes what it has read from MuJoCo's state before it stepped the "
+                "environment, or reads seldom, and noise does not reach that: let it read after each step, "
+                "and keep that"
+            )

@@ -41,7 +41,8 @@ def shaped(vector: np.ndarray, like: Any, space: spaces.Space[Any]) -> Any:
     """Returns a vector as an observation of the shape and types of another one."""
     if not isinstance(space, spaces.Dict):
         array = np.asarray(like)
-        return vector.astype(array.dtype).reshape(array.shape)
+        values = vector.astype(array.dtype).reshape(array.shape)
+        return type(like)(values.tolist()) if type(like) in (list, tuple) else values
     parts, at = {}, 0
     for key, part in space.spaces.items():
         array = np.asarray(like[key])

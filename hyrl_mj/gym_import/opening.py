@@ -263,7 +263,8 @@ def _checked(env: Any, name: str) -> mujoco.MjModel:
             "environment of MuJoCo"
         )
     for part in parts_of(env.observation_space).values():
-        is_image = isinstance(part, spaces.Box) and (len(part.shape) > 2 or part.dtype == np.uint8)
+        rows = 2 if part.dtype == np.uint8 else 3
+        is_image = isinstance(part, spaces.Box) and len(part.shape) >= rows
         if is_image or not isinstance(part, spaces.Box):
             what = "images" if is_image else f"a space {type(part).__name__}"
             raise BadInput(

@@ -189,7 +189,8 @@ class EnvironmentSpec:
         recalled: (o,) bool, the columns of the innermost observation that episodes change apart from the
             state, whatever their places.
         derived: `Derived`.
-        sensing: whether wrappers read MuJoCo's state for what they observe, and see it under noise.
+        sensing: how `derived` is shown to wrappers that read MuJoCo's state for what they observe, and see it
+            under noise; "" if none does.
         anew: whether a reset changes what the next one does to a wrapper: each episode takes a new instance.
         moves: (o,) bool, the columns of an observation at rest that follow the chart.
         at_rest: a matrix (t, o) that gives what is observed at rest at z from `terms` of z, if one does.
@@ -227,7 +228,7 @@ class EnvironmentSpec:
     plane: tuple[Axis, ...] = ()
     recalled: np.ndarray = field(default_factory=_none)
     derived: Derived = "unknown"
-    sensing: bool = False
+    sensing: Derived | Literal[""] = ""
     anew: bool = False
     moves: np.ndarray = field(default_factory=_none)
     at_rest: np.ndarray | None = None

@@ -16,11 +16,13 @@ from hyrl_mj.errors import BadInput
 from hyrl_mj.files import trust
 from hyrl_mj.gym_import import fingerprint as written
 from hyrl_mj.gym_import.coordinates import own_of
-from hyrl_mj.gym_import.instance import Instance
+from hyrl_mj.gym_import.instance import Instance, check_unveiled
 from hyrl_mj.gym_import.specification import EnvironmentSpec
 from hyrl_mj.system import limits
 from hyrl_mj.tasks import Outcome
 
+# Of so many runs that are judged one shows wrappers nothing but where the noise shows the robot.
+VEILED = 8
 Arrays = tuple[np.ndarray, ...]
 # Runs of a judgement that an environment plays, too, which goes on from episode to episode; all of them where
 # something outlasts its resets.
@@ -67,6 +69,7 @@ class Stage:
         self._judges: dict[bool, list[Instance]] = {True: [], False: []}
         self._lived: dict[bool, Instance] = {}  # which is never replaced
         self._wears = spec.anew  # whether something has outlasted a reset
+        self._veiled: list[Instance] = []
         self._resting: Instance | None = None
         self._fresh: Instance | None = None  # which has only been reset
         self._shared: written.Fingerprint | None = None  # by a new instance with all others
@@ -157,18 +160,41 @@ class Stage:
         if self._fresh is None:
             self._fresh = self._new(real=False)
             self._fresh.reset()
+        fresh = self._fresh
         for i, run in enumerate(runs):
             # A time limit of its own would end a run that is simulated for longer.
             as_it_is = len(run.inputs) <= self.spec.max_steps
-            noises = [run.noise]
-            if self.spec.wrapped and run.noise.any():
-                noises.append(np.zeros_like(run.noise))
-            for noise in noises:
+
+            def judged(run: Played, noise: np.ndarray, as_it_is: bool = as_it_is) -> bool:
                 real = self._renewed(self._judges[as_it_is], as_it_is)
-                judge(run, real, noise, self._fresh)
+                alike = judge(run, real, noise, fresh)
                 self._judges[as_it_is].append(real)
+                return alike
+
+            judged(run, run.noise)
             if len(runs) > 1 and (i < LIVED or self._wears) and run.outcome != Outcome.UNSTABLE:
                 self._live(run, as_it_is)
+            if not (self.spec.wrapped and run.noise.any()):
+                continue
+            if not judged(run, np.zeros_like(run.noise)):
+                for part in _parts(run):
+                    judged(
+                        part, part.noise * (np.arange(len(part.noise)) < len(part.inputs))[:, None]
+                    )
+            if i % VEILED == 0:
+                self._check_veiled(run)
+
+    def _check_veiled(self, run: Played) -> None:
+        """Raises `BadInput` if wrappers read MuJoCo's state at another time than is known."""
+        real = self._renewed(self._veiled)
+        real.learn(sensing=real.spec.sensing or "now")
+        real.veiled, real.tamper = True, tuple  # they may write there
+        veiled = (
+            (run.path[0] if k == 0 else real.spec.z(seen.state[None])[0], seen.observation)
+            for k, seen in enumerate(real.play(run.start, run.inputs, run.noise))
+        )
+        check_unveiled(real.name, zip(run.path, run.observations, strict=False), veiled)
+        self._veiled.append(real)
 
     def _live(self, run: Played, as_it_is: bool) -> None:
         """Plays a run as a further episode of an environment that is never replaced, as its user has one."""
@@ -216,13 +242,30 @@ class Stage:
         return instance
 
 
-def judge(run: Played, real: Instance, noise: np.ndarray, fresh: Instance | None) -> None:
+def _parts(run: Played) -> list[Played]:
+    """Returns a run up to its end and up to earlier samples, as others go on from there."""
+    n = len(run.inputs)
+    ends = sorted({n // 4, n // 2, 3 * n // 4} - {0, n})
+    return [run] + [
+        replace(
+            run,
+            inputs=run.inputs[:k],
+            path=run.path[: k + 1],
+            outcome=int(Outcome.RUNNING),
+            cut=False,
+            noise=run.noise[: k + 1],
+        )
+        for k in ends
+    ]
+
+
+def judge(run: Played, real: Instance, noise: np.ndarray, fresh: Instance | None) -> bool:
     """Plays a run in an environment that its user would make.
 
     That is put to the start and stepped, past all that lets episodes be played side by side. There is no
     tolerance: the same code computes the same from the same numbers. Without the run's noise the inputs may
     lead another way, as where a controller of a wrapper sees it; where they lead the same way, the run ends
-    alike.
+    alike. Where they do not, it ends alike without the noise of its last sample, or of an earlier one, alone.
 
     Args:
         run: the run.
@@ -230,6 +273,9 @@ def judge(run: Played, real: Instance, noise: np.ndarray, fresh: Instance | None
         noise: (k + 1, d) that of the run, or none.
         fresh: another one, which has only been reset: what it observes in a state shows what `real` has
             stored on its way there; None where `real` goes on from other episodes.
+
+    Returns:
+        Whether it went the same way.
 
     Raises:
         BadInput: the run went otherwise.
@@ -251,8 +297,10 @@ def judge(run: Played, real: Instance, noise: np.ndarray, fresh: Instance | None
         real.finish()
     states, observations, reports = zip(*samples, strict=True)
     path = np.vstack([run.path[:1], spec.z(np.array(states[1:]).reshape(-1, len(run.start)))])
-    if len(samples) == 1 or (not heard and not np.array_equal(path, run.path)):
-        return
+    if len(samples) == 1:
+        return True
+    if not heard and not np.array_equal(path, run.path):
+        return False
     told = np.array(reports[1:], dtype=float)
     if heard:
         seen = observations[: len(run.observations)]
@@ -260,7 +308,7 @@ def judge(run: Played, real: Instance, noise: np.ndarray, fresh: Instance | None
         _compare(real, "the chart's coordinate", run.path, path)
         _compare(real, "reward", run.rewards, told[:, :1])
     if run.outcome == Outcome.UNSTABLE:
-        return
+        return True
     success, ends = spec.criterion.judged(told)
     if run.cut and ends[-1] == Outcome.RUNNING:
         ends[-1] = spec.criterion.verdict(success[-1:])[0]
@@ -270,6 +318,10 @@ def judge(run: Played, real: Instance, noise: np.ndarray, fresh: Instance | None
         ours, theirs = (Outcome(int(values[k])).label for values in (expected, ends))
         how = "" if heard else " without the noise, which must not judge"
         raise _goes_another_way(real, f"after {k + 1} sample(s) it is {ours}, and {theirs}{how}")
+        raise _goes_another_way(
+            real.name, f"after {k + 1} sample(s) it is {ours}, and {theirs}{how}"
+        )
+    return True
 
 
 def _compare(real: Instance, what: str, ours: np.ndarray | None, theirs: Any) -> None:

@@ -10,20 +10,24 @@ import copy
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import islice
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.gym_import.fingerprint import DEEPEST, FUNCTIONS, differing, has_no_memory
-from hyrl_mj.gym_import.instance import Instance, Seen
+from hyrl_mj.gym_import.instance import Instance, Seen, check_unveiled
 from hyrl_mj.gym_import.observations import flat
-from hyrl_mj.gym_import.specification import EnvironmentSpec
+from hyrl_mj.gym_import.specification import Derived, EnvironmentSpec
 from hyrl_mj.gym_import.trials import EPISODES, HELD, PLACES, SAMPLES
 
 # What changes by this share of a displacement follows the place [share].
 FOLLOWS = 0.01
+# In how many samples what is told is changed, the start being the first, and for how many it is looked
+# whether wrappers read MuJoCo's state seldom.
+TOLD, SELDOM = 3, 200
 
 # What an environment tells beside its observation, by name.
 Told = dict[str, Any]
@@ -226,69 +230,104 @@ def _outlasting(spec: EnvironmentSpec, old: Instance, rng: np.random.Generator) 
 
 
 def check_told(spec: EnvironmentSpec) -> None:
-    """Raises `BadInput` if wrappers observe what `info` or attributes of the environment tell of the place.
+    """Raises `BadInput` if wrappers observe what `info`, rewards or attributes tell of the place.
 
-    Runs are played from places on the chart, and from places that are displaced. What the environment tells
-    in the latter is then put into the former, whose observation has to stay the same.
+    Runs are played from places on the chart, and from places that are displaced a little, or are elsewhere.
+    What the environment tells in the latter is then put into the former, whose observation has to stay the
+    same: of a displacement all that follows it, and of another place truths, words and whole numbers, as a
+    velocity may differ there.
     """
     rng, step = np.random.default_rng(9), spec.nudge
     least = FOLLOWS * float(step[step > 0].min(initial=np.inf))
     usual, other = Instance(spec), Instance(spec)
-    for z in spec.anywhere(rng, 6):
-        inputs, none = [usual.drawn(rng) for _ in range(2)], np.zeros((3, spec.dimension))
-        state, displaced = spec.state_at(np.array([z, z + step]))
-        plain = _run(usual, state, inputs, none)
-        elsewhere = _run(other, displaced, inputs, none)
-        if len(plain) != len(elsewhere):
-            continue
+    none = np.zeros((HELD + 1, spec.dimension))
+    for i, z in enumerate(spec.anywhere(rng, 4 * EPISODES)):
+        inputs = [usual.drawn(rng)] * HELD
+        far = spec.anywhere(rng, 1)[0]
+        state, elsewhere = spec.state_at(np.array([z, far if i % 4 else z + step]))
+        here = _run(usual, state, inputs, none)
+        there = _run(other, elsewhere, inputs[: TOLD - 1], none[:TOLD])
+        differs = _jumps if i % 4 else partial(_far, least=least)
         follow = [
-            {name: there[name] for name in here if _far(here[name], there.get(name), least)}
-            for (_, here), (_, there) in zip(plain, elsewhere, strict=True)
+            {name: b[name] for name in a if name in b and differs(a[name], b[name])}
+            for (_, a), (_, b) in zip(here, there, strict=False)
         ]
         if not any(follow):
             continue
-        changed = _run(Instance(spec), state, inputs, none, changes=follow)
-        for (seen, _), (now, _), names in zip(plain, changed, follow, strict=False):
+        try:
+            changed = _run(Instance(spec), state, inputs, none, changes=follow)
+        except BadInput:  # it fails with values that it does not know
+            continue
+        names = list(dict.fromkeys(name for told in follow for name in told))
+        for (seen, _), (now, _) in zip(here, changed, strict=False):
+            if not np.array_equal(seen.state, now.state, equal_nan=True):
+                break  # what is told moves the robot
             if not np.array_equal(seen.observation, now.observation, equal_nan=True):
                 raise BadInput(
-                    f"a wrapper of {spec.name} observes {' or '.join(names)}, which follows the place and "
-                    "which noise does not reach: let it observe what the environment observes"
+                    f"a wrapper of {spec.name} observes {' or '.join(names[:4])}, which follows the place "
+                    "and which noise does not reach: let it observe what the environment observes"
                 )
-            if names:
-                break  # from here on the run may be another one
 
 
-def senses(spec: EnvironmentSpec) -> bool:
-    """Returns whether wrappers read MuJoCo's state for what they observe.
+def senses(spec: EnvironmentSpec) -> Derived | Literal[""]:
+    """Returns how wrappers that read MuJoCo's state for what they observe are shown it under noise.
 
-    The same runs under noise are played twice, once with the true state shown to the wrappers, and once with
-    the state where the noise shows the robot.
+    The same runs under noise are played with the true state shown to the wrappers, with the state where the
+    noise shows the robot, and with that state before the wrappers step the environment, too.
 
     Raises:
-        BadInput: wrappers do, and tell from that state as well how the episode goes.
+        BadInput: wrappers do, and tell from that state as well how the episode goes, or they observe where
+            the robot was before they stepped the environment, where noise does not come.
     """
     rng, differ = np.random.default_rng(6), {"observation": False, "report": False}
     places, step = spec.anywhere(rng, PLACES), spec.nudge
     starts = [(spec.state, min(SAMPLES, spec.max_steps))] * EPISODES
     starts += [(state, min(3, spec.max_steps)) for state in spec.state_at(places)]
-    both = [Instance(replace(spec, sensing=sensing)) for sensing in (False, True)]
+    # Some measure now and then.
+    starts += [(state, min(SELDOM, spec.max_steps)) for state in spec.state_at(places[:2])]
+    plain, shown, veiled = (Instance(replace(spec, sensing=how)) for how in ("", "now", "now"))
+    veiled.veiled = True
     for seed, (start, samples) in enumerate(starts):
         noises = rng.uniform(-step, step, (samples + 1, len(step)))
-        drawn = [both[0].drawn(rng) for _ in range(samples)]
+        drawn = [plain.drawn(rng) for _ in range(samples)]
         inputs = [drawn[k - k % HELD] for k in range(samples)]
-        true, shown = (_run(one, start, inputs, noises, seed % EPISODES) for one in both)
+        runs = [_run(one, start, inputs, noises, seed % EPISODES) for one in (plain, shown, veiled)]
         for what in differ:
             differ[what] |= any(
                 not np.array_equal(getattr(a, what), getattr(b, what), equal_nan=True)
-                for (a, _), (b, _) in zip(true, shown, strict=False)  # one may have ended before
+                for (a, _), (b, _) in zip(*runs[:2], strict=False)  # one may have ended before
             )
+        check_unveiled(spec.name, *([seen[:2] for seen, _ in run] for run in runs[1:]))
     if all(differ.values()):
         raise BadInput(
             f"a wrapper of {spec.name} reads MuJoCo's state for what it observes, which noise moves, and for "
             "its reward, its info or the end of an episode, which it must not: let it observe what the "
             "environment gives it, or let only the environment judge"
         )
-    return differ["observation"]
+    return _as_of(spec) if differ["observation"] else ""
+
+
+def _as_of(spec: EnvironmentSpec) -> Derived:
+    """Returns from when the derived quantities are that wrappers read, "now" if it is not known.
+
+    A run without noise is compared with runs whose noise is too small to matter.
+    """
+    rng, none = np.random.default_rng(14), np.zeros((SAMPLES + 1, spec.dimension))
+    inputs, little = [Instance(spec).drawn(rng)] * SAMPLES, none + 1e-9 * spec.nudge
+    ways: dict[Derived | Literal[""], np.ndarray] = {"": none, "now": little, "earlier": little}
+    seen = []
+    for how, noises in ways.items():
+        run = _run(Instance(replace(spec, sensing=how)), spec.state, inputs, noises)
+        seen.append(np.array([one.observation for one, _ in run]))
+    n = min(map(len, seen))
+    off = [float(np.abs(one[:n] - seen[0][:n]).max()) for one in seen[1:]]
+    if min(off) > 1e-6 * max(1.0, float(np.abs(seen[0]).max())):
+        spec.found["lag"] = (
+            "wrappers observe quantities of MuJoCo from before the end of a step, and under noise those of "
+            f"its end, which differ by up to {off[0]:.3g}"
+        )
+        return "now"
+    return "now" if off[0] <= off[1] else "earlier"
 
 
 def _run(
@@ -312,14 +351,14 @@ def _run(
     told: list[Told] = []
 
     def tamper(rest: tuple[Any, ...]) -> tuple[Any, ...]:
-        new = {} if changes is None else changes[len(told)]
-        info = dict(rest[-1])
+        new: Told = dict(*(changes or [])[len(told) :][:1])
+        info, reward = dict(rest[-1]), dict(zip(("the reward",), rest[:-1], strict=False))
         places = held(instance.inner, info)
-        told.append({name: copy.deepcopy(owner[key]) for name, owner, key in places})
+        told.append({name: copy.deepcopy(owner[key]) for name, owner, key in places} | reward)
         for name, owner, key in [*held(instance.inner, info)] if new else ():
             if name in new:
                 owner[key] = copy.deepcopy(new[name])
-        return (*rest[:-1], info)
+        return (*(new.get("the reward", first) for first in rest[:-1][:1]), *rest[1:-1], info)
 
     instance.tamper, found = tamper, []
     for seen in instance.play(start, inputs, noises, seed):
@@ -330,16 +369,16 @@ def _run(
 
 
 def held(inner: Any, info: dict[str, Any]) -> Iterator[tuple[str, Any, Any]]:
-    """Yields name, owner and key of all numbers in `info` and in attributes, also within objects."""
+    """Yields name, owner and key of numbers and words in `info` and in attributes, also within objects."""
     seen = {id(inner)}
     for kind, owner in (("info", info), ("attribute", getattr(inner, "__dict__", {}))):
         yield from _within(owner, f"{kind} ", seen, 0)
 
 
 def _within(owner: Any, path: str, seen: set[int], depth: int) -> Iterator[tuple[str, Any, Any]]:
-    """Yields names, owners and keys of the numbers in a dictionary or a list, and in what it holds."""
+    """Yields names, owners and keys of what a dictionary or a list holds, as `held` does."""
     for key, value in [*owner.items()] if isinstance(owner, dict) else [*enumerate(owner)]:
-        if numbers_of(value) is not None:
+        if isinstance(value, str) or numbers_of(value) is not None:
             yield f"{path}{key}", owner, key
         elif depth < DEEPEST and id(value) not in seen:
             seen.add(id(value))
@@ -360,10 +399,10 @@ def numbers_of(value: Any) -> np.ndarray | None:
         parts = [numbers_of(part) for part in value]
         numbers = [part for part in parts if part is not None]
         return np.concatenate(numbers) if 0 < len(numbers) == len(parts) else None
-    if not isinstance(value, int | float | np.number | np.ndarray):
+    if not isinstance(value, int | float | np.generic | np.ndarray):
         return None
     array = np.asarray(value)
-    return array.ravel().astype(float) if array.dtype.kind in "iuf" else None
+    return array.ravel().astype(float) if array.dtype.kind in "biuf" else None
 
 
 def _far(here: Any, there: Any, least: float) -> bool:
@@ -372,3 +411,13 @@ def _far(here: Any, there: Any, least: float) -> bool:
     if a is None or b is None or len(a) != len(b):
         return False
     return bool(np.abs(a - b).max(initial=0.0) >= least)
+
+
+def _jumps(here: Any, there: Any) -> bool:
+    """Returns whether what is told at two places are other words, truths or whole numbers."""
+    if isinstance(here, str):
+        return bool(here != there)
+    a, b = numbers_of(here), numbers_of(there)
+    if a is None or b is None or len(a) != len(b):
+        return False
+    return all(np.array_equal(x, np.rint(x)) for x in (a, b)) and not np.array_equal(a, b)

@@ -183,6 +183,28 @@ def rests(model: mujoco.MjModel, camera: mujoco.MjvCamera) -> bool:
     return bool(fixed and model.cam_bodyid[number] == 0)
 
 
+# What has a place, by the field of MuJoCo's data.
+POINTS = {
+    "site_xpos": mujoco.mjtObj.mjOBJ_SITE,
+    "xpos": mujoco.mjtObj.mjOBJ_BODY,
+    "geom_xpos": mujoco.mjtObj.mjOBJ_GEOM,
+}
+
+
+def points_of(model: mujoco.MjModel, name: str) -> list[tuple[str, int]]:
+    """Returns where the places of all sites, bodies and geoms of a name are, as `point_of` does.
+
+    A name as "body tip" is that of one kind.
+    """
+    there = {where: names(model, kind) for where, kind in POINTS.items()}
+    found = [(where, of_kind.index(name)) for where, of_kind in there.items() if name in of_kind]
+    kind, _, rest = name.partition(" ")
+    where = {"site": "site_xpos", "body": "xpos", "geom": "geom_xpos"}.get(kind, "")
+    if not found and rest in there.get(where, ()):
+        return [(where, there[where].index(rest))]
+    return found
+
+
 def point_of(model: mujoco.MjModel, name: str) -> tuple[str, int]:
     """Returns where the place of a site, a body or a geom is in MuJoCo's data: ("site_xpos", 2).
 
@@ -191,17 +213,11 @@ def point_of(model: mujoco.MjModel, name: str) -> tuple[str, int]:
     Raises:
         BadInput: nothing has that name; the message lists the names there are.
     """
-    kinds = {
-        "site_xpos": mujoco.mjtObj.mjOBJ_SITE,
-        "xpos": mujoco.mjtObj.mjOBJ_BODY,
-        "geom_xpos": mujoco.mjtObj.mjOBJ_GEOM,
-    }
-    all_names = {where: names(model, kind) for where, kind in kinds.items()}
-    for where, there in all_names.items():
-        if name in there:
-            return where, there.index(name)
+    if found := points_of(model, name):
+        return found[0]
     if name == "tracked" and model.njnt:
         return "xpos", int(model.jnt_bodyid[0])
+    all_names = {where: names(model, kind) for where, kind in POINTS.items()}
     named = [n for there in all_names.values() for n in there if not n.startswith("(")]
     raise unknown(f"site, body or geom in model {model_name(model)}", name, dict.fromkeys(named))
 
