@@ -331,8 +331,19 @@ class Plant:
 
 
 def actuator_columns(model: mujoco.MjModel, names: Sequence[str]) -> list[int]:
-    """Returns the ids of the named actuators, or raises `BadInput` with the names that the model has."""
-    return [mjcf.object_id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name) for name in names]
+    """Returns the columns of ctrl that the named actuators have.
+
+    Raises:
+        BadInput: the model has no such actuator, or one has several controls, as a pid or one on a ball may.
+    """
+    ids = [mjcf.object_id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name) for name in names]
+    for name, actuator in zip(names, ids, strict=True):
+        if (count := int(model.actuator_ctrlnum[actuator])) != 1:
+            raise BadInput(
+                f"actuator {name} of {mjcf.model_name(model)} has {count} controls, and an input is one: "
+                "give it a single one, or let the task's control() give them, with a numeric as the input"
+            )
+    return [int(model.actuator_ctrladr[actuator]) for actuator in ids]
 
 
 def input_limits(
