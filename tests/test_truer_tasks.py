@@ -583,7 +583,7 @@ def test_an_input_drives_its_own_actuator_after_one_of_two_controls(tmp_path):
 
 def test_an_obstacle_on_a_body_that_stands_still_is_where_it_is_in_the_world(tmp_path):
     def text(xml):
-        nested = '<body pos="1 0.3 0" euler="0 0 90"><geom name="obstacle" size="1" pos="-0.3 -0.5 0"/></body>'
+        nested = '<body pos="1 0.3 0" euler="0 0 90"><geom name="obstacle" size="1" pos="-.3 -.5 0"/></body>'
         return xml.replace("obstacle", "other").replace("<worldbody>", "<worldbody>" + nested)
 
     model = get_task(write(tmp_path, text=text)).model
