@@ -540,9 +540,14 @@ def test_who_looks_ahead_does_so_from_the_whole_state(tmp_path):
 
 
 def test_a_point_off_the_robot_is_no_place_of_it(tmp_path):
-    moved = get_task(
-        write(tmp_path, text=lambda xml: xml.replace("<body", '<body pos="0.9 0 0"', 1))
-    )
+    other = '<body pos="5 5 0"><joint type="slide"/><geom size="0.1"/></body></worldbody>'
+    own = "    def state(self, z, rng=None):\n        return np.hstack([z, 0 * z[:, :1]]), None\n"
+
+    def text(xml):  # another robot is far away
+        xml = xml.replace("<body", '<body pos="0.9 0 0"', 1).replace("</worldbody>", other)
+        return xml.replace('qpos="0 0"', 'qpos="0 0 0"')
+
+    moved = get_task(write(tmp_path, {"methods": own}, text=text))
     with pytest.raises(BadInput, match="these are not the place of tracked"):
         trial.try_place(moved)
 

