@@ -283,6 +283,29 @@ def test_a_held_control_is_clamped_as_mujoco_does(key, speed, tmp_path):
     assert plant.qpos[0, 0] == pytest.approx(0.05 * speed)
 
 
+@pytest.mark.parametrize("clamps", [True, False])
+def test_controls_are_clamped_where_mujoco_does(clamps, tmp_path):
+    """Also one that is held at 0 without a keyframe, and those of an inner loop."""
+    flag = "" if clamps else '<flag clampctrl="disable"/>'
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><option gravity="0 0 0">{flag}</option><custom><numeric name="v" data="-9 9"/></custom>'
+        '<worldbody><body><joint name="x" type="slide"/><geom size="1"/></body></worldbody>'
+        '<actuator><velocity name="v" joint="x" kv="9e3" ctrlrange="0.5 2"/><motor name="u" joint="x" '
+        'ctrlrange="-1 1"/></actuator><sensor><jointpos joint="x"/></sensor></mujoco>'
+    )
+
+    def control(u, qpos, qvel):
+        return np.hstack([u, 0 * u])
+
+    for inputs, loop, u in ((("u",), None, 0.0), (("v",), control, 9.0)):
+        plant, data = Plant(model, inputs, 1, control=loop), mujoco.MjData(model)
+        data.ctrl[0] = u
+        for _ in range(5):
+            plant.step(np.array([[u]]))
+            mujoco.mj_step(model, data)
+        np.testing.assert_array_equal(plant.qpos[0], data.qpos)
+
+
 def test_the_activation_of_the_keyframe_holds(tmp_path):
     held = '<intvelocity name="ahead" joint="x" kp="200" kv="20" actrange="-9 9"/>'
     steered = VELOCITY.format(name="u", joint="y", kv=1e9, more='ctrlrange="-1 1"')
