@@ -247,6 +247,11 @@ def test_a_new_task_is_written_into_a_folder(tmp_path):
         ("_", "letters, digits"),
         ("vehicle", "a task vehicle already"),
         ("numpy", "a Python package numpy already"),
+        (
+            "outcome",
+            "another use for the word Outcome",
+        ),  # its class would hide what the file imports
+        ("true", "another use for the word True"),
     ],
 )
 def test_a_name_that_cannot_be_one_is_refused(tmp_path, name, says):

@@ -110,7 +110,9 @@ Alley.verdict = Task.verdict
 def test_where_episodes_end_as_a_success_to_be_close_to_the_set_point_is_not_enough():
     alley = Alley()
     lattice = Lattice.tabulate(alley, Grid.with_cells(alley.chart, 60))
-    assert (alley.verdict(np.array([[0.5, 0.0]])) == Outcome.REACHED).all()
+    beside_the_line = np.array([[0.5, 0.0]])
+    assert alley.arrived(beside_the_line).all()
+    assert (alley.verdict(beside_the_line) == Outcome.STALLED).all()
     assert not lattice.arrived.any()
     assert (lattice.after == lattice.nodes).any(), "the samples over the line arrive"
 

@@ -5,8 +5,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
-import trapped_plants
-from trapped_plants import TRAPS, Robot, dial, drawn, ends, examined, methods, vehicle
+from trapped_plants import TRAPS, Robot, dial, ends, examined, methods, task_of, vehicle
 
 from hyrl_mj import BadInput
 from hyrl_mj.judging.game import Lattice
@@ -39,12 +38,6 @@ def test_honest_robots_are_proved(tmp_path):
 
 
 # ---- each trap by itself
-
-
-def task_of(robot, folder, monkeypatch):
-    """The task of one robot."""
-    monkeypatch.setattr(trapped_plants, "TRAPS", {"this": lambda rng: robot})
-    return drawn(0, folder)[1]
 
 
 @pytest.mark.parametrize("make", [vehicle, dial])

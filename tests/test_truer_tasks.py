@@ -7,14 +7,17 @@ import pickle
 import subprocess
 import sys
 
+import mujoco
 import numpy as np
 import pytest
 from planted import homing_policy
-from trapped_plants import CALM, MJCF, TASK, VELOCITY, vehicle
+from trapped_plants import CALM, MJCF, TASK, VELOCITY, dial, task_of, vehicle
 
 import hyrl_mj
 from hyrl_mj import BadInput, HybridController, Noise, from_callable, get_task, simulate
 from hyrl_mj.judging.game import Game
+from hyrl_mj.physics import mjcf
+from hyrl_mj.physics.plant import Plant
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.policies.external import read_agent
 from hyrl_mj.sets import Grid, GridSet
@@ -280,6 +283,29 @@ def test_a_held_control_is_clamped_as_mujoco_does(key, speed, tmp_path):
     assert plant.qpos[0, 0] == pytest.approx(0.05 * speed)
 
 
+@pytest.mark.parametrize("clamps", [True, False])
+def test_controls_are_clamped_where_mujoco_does(clamps, tmp_path):
+    """Also one that is held at 0 without a keyframe, and those of an inner loop."""
+    flag = "" if clamps else '<flag clampctrl="disable"/>'
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><option gravity="0 0 0">{flag}</option><custom><numeric name="v" data="-9 9"/></custom>'
+        '<worldbody><body><joint name="x" type="slide"/><geom size="1"/></body></worldbody>'
+        '<actuator><velocity name="v" joint="x" kv="9e3" ctrlrange="0.5 2"/><motor name="u" joint="x" '
+        'ctrlrange="-1 1"/></actuator><sensor><jointpos joint="x"/></sensor></mujoco>'
+    )
+
+    def control(u, qpos, qvel):
+        return np.hstack([u, 0 * u])
+
+    for inputs, loop, u in ((("u",), None, 0.0), (("v",), control, 9.0)):
+        plant, data = Plant(model, inputs, 1, control=loop), mujoco.MjData(model)
+        data.ctrl[0] = u
+        for _ in range(5):
+            plant.step(np.array([[u]]))
+            mujoco.mj_step(model, data)
+        np.testing.assert_array_equal(plant.qpos[0], data.qpos)
+
+
 def test_the_activation_of_the_keyframe_holds(tmp_path):
     held = '<intvelocity name="ahead" joint="x" kp="200" kv="20" actrange="-9 9"/>'
     steered = VELOCITY.format(name="u", joint="y", kv=1e9, more='ctrlrange="-1 1"')
@@ -537,9 +563,14 @@ def test_who_looks_ahead_does_so_from_the_whole_state(tmp_path):
 
 
 def test_a_point_off_the_robot_is_no_place_of_it(tmp_path):
-    moved = get_task(
-        write(tmp_path, text=lambda xml: xml.replace("<body", '<body pos="0.9 0 0"', 1))
-    )
+    other = '<body pos="5 5 0"><joint type="slide"/><geom size="0.1"/></body></worldbody>'
+    own = "    def state(self, z, rng=None):\n        return np.hstack([z, 0 * z[:, :1]]), None\n"
+
+    def text(xml):  # another robot is far away
+        xml = xml.replace("<body", '<body pos="0.9 0 0"', 1).replace("</worldbody>", other)
+        return xml.replace('qpos="0 0"', 'qpos="0 0 0"')
+
+    moved = get_task(write(tmp_path, {"methods": own}, text=text))
     with pytest.raises(BadInput, match="these are not the place of tracked"):
         trial.try_place(moved)
 
@@ -556,3 +587,62 @@ def test_a_plane_is_passed_on_no_side(tmp_path):
     plane = '<worldbody><geom name="obstacle_floor" type="plane" size="9 9 1" contype="0" conaffinity="0"/>'
     task = get_task(write(tmp_path, text=lambda xml: xml.replace("<worldbody>", plane)))
     assert "floor" not in task.obstacles
+
+
+def test_an_input_drives_its_own_actuator_after_one_of_two_controls(tmp_path):
+    pid = '<pid name="ahead" joint="x" kp="1" kv="1e9" input="pos vel" posrange="-9 9" velrange="-2 2"/>'
+    steered = VELOCITY.format(name="u", joint="y", kv=1e9, more='ctrlrange="-1 1"')
+
+    def text(xml):
+        return xml.replace('ctrl="1 0"', 'ctrl="0 1 0"')
+
+    task = get_task(write(tmp_path, actuators=pid + steered, text=text))
+    judge_task(task)
+    plant, data = task.plant(1), mujoco.MjData(task.model)
+    plant.step(np.array([[0.5]]))
+    data.ctrl[:] = 0, 1, 0.5
+    mujoco.mj_step(task.model, data)
+    np.testing.assert_array_equal(plant.qpos[0], data.qpos)
+    assert data.qpos[1] > 0.02
+    assert mjcf.names(task.model, mujoco.mjtObj.mjOBJ_ACTUATOR) == ["ahead", "u"]
+    with pytest.raises(BadInput, match=r"actuator ahead of .* has 2 controls"):
+        Plant(task.model, ("ahead",), 1)
+
+
+def test_an_obstacle_on_a_body_that_stands_still_is_where_it_is_in_the_world(tmp_path):
+    def text(xml):
+        nested = '<body pos="1 0.3 0" euler="0 0 90"><geom name="obstacle" size="1" pos="-.3 -.5 0"/></body>'
+        return xml.replace("obstacle", "other").replace("<worldbody>", "<worldbody>" + nested)
+
+    model = get_task(write(tmp_path, text=text)).model
+    np.testing.assert_allclose(mjcf.geom_pos(model, "obstacle"), [1.5, 0, 0], atol=1e-12)
+    np.testing.assert_array_equal(mjcf.site_pos(model, "tracked"), np.zeros(3))  # on the robot
+
+
+@pytest.mark.parametrize(
+    ("ending", "outcome"),
+    [(PY["ending"], "stalled"), ("ends = np.zeros(len(measured), int)", "reached")],
+)
+def test_who_is_still_under_way_has_not_arrived_where_the_end_says_who_has(
+    ending, outcome, tmp_path
+):
+    own = {"max_steps": "10", "methods": "    def miss(self, z):\n        return np.abs(z[:, 1])\n"}
+    task = get_task(write(tmp_path, own | {"ending": ending}))
+    assert task.ends_well == (outcome == "stalled")
+    assert Outcome(task.verdict(np.array([[0.6, 0.1]]))[0]).label == outcome
+
+
+@pytest.mark.parametrize(
+    ("robot", "chart"),
+    [
+        (vehicle(), '("x", "y"), ("m", "m"), (0.0, -1.5), (3.0, 1.5), (False, True)'),
+        (dial(), '("theta",), ("rad",), (0.0,), (np.pi,), (True,)'),
+        (dial(), '("theta",), ("deg",), (0.0,), (360.0,), (True,)'),
+    ],
+)
+def test_a_period_that_is_no_whole_turn_is_refused(robot, chart, tmp_path, monkeypatch):
+    task = task_of(robot._replace(py=robot.py | {"chart": chart}), tmp_path, monkeypatch)
+    with pytest.raises(
+        BadInput, match=r"is periodic and comes back after .* the robot is elsewhere"
+    ):
+        checks._check_turns(task, task.chart.draw(9, np.random.default_rng(0)))

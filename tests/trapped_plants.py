@@ -331,6 +331,12 @@ def drawn(seed: int, folder: Path):
     return trap, hyrl_mj.get_task(folder / f"{name}.py")
 
 
+def task_of(robot, folder, monkeypatch):
+    """The task of one robot."""
+    monkeypatch.setitem(globals(), "TRAPS", {"this": lambda rng: robot})
+    return drawn(0, folder)[1]
+
+
 def policy_of(task):
     """A network: past the pillar on the left, or the shorter way to the set-point of the dial."""
     if task.chart.dimension == 1:

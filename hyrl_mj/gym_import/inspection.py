@@ -158,7 +158,7 @@ def _learn_spaces(instance: Instance) -> None:
     levels = int(actions.n) if isinstance(actions, spaces.Discrete) else None
     ends = (0, levels - 1) if levels is not None else (actions.low, actions.high)
     low, high = (np.array(end, dtype=float).ravel() for end in ends)
-    names = [model.actuator(i).name.rpartition("/")[2] for i in range(model.nu)]
+    names = [model.actuator(i).name.rpartition("/")[2] for i in range(model.nactuator)]
     if len(names) != len(low) or not all(names):
         names = [f"action[{i}]" for i in range(len(low))]
     is_dict = isinstance(space, spaces.Dict)

@@ -57,13 +57,17 @@ def _setpoints(instance: Instance, state: np.ndarray, now: np.ndarray) -> np.nda
         physics.write(one)
         lengths.append(data.actuator_length.copy())
     moved = now.copy()
-    for i in range(model.nu):
+    for i in range(model.nactuator):
         gain, bias = model.actuator_gainprm[i, 0], model.actuator_biasprm[i, 1]
         if model.actuator_biastype[i] and bias and gain:
-            by = -bias / gain * (lengths[1][i] - lengths[0][i])
+            by = -bias / gain * (lengths[1] - lengths[0])[model.actuator_outadr[i]]
             at = model.actuator_actadr[i]
             has_act = model.actuator_dyntype[i] and at >= 0
-            column = physics.columns["act"][at] if has_act else physics.columns["ctrl"][i]
+            column = (
+                physics.columns["act"][at]
+                if has_act
+                else physics.columns["ctrl"][model.actuator_ctrladr[i]]
+            )
             moved[column] += by
     return moved
 

@@ -140,7 +140,7 @@ def object_id(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str) -> int:
 def names(model: mujoco.MjModel, kind: mujoco.mjtObj) -> list[str]:
     """Returns the names of all objects of one kind, in the order of their ids."""
     count = {
-        mujoco.mjtObj.mjOBJ_ACTUATOR: model.nu,
+        mujoco.mjtObj.mjOBJ_ACTUATOR: model.nactuator,  # some have several controls
         mujoco.mjtObj.mjOBJ_BODY: model.nbody,
         mujoco.mjtObj.mjOBJ_CAMERA: model.ncam,
         mujoco.mjtObj.mjOBJ_GEOM: model.ngeom,
@@ -228,8 +228,8 @@ def model_name(model: mujoco.MjModel) -> str:
 
 
 def site_pos(model: mujoco.MjModel, name: str) -> np.ndarray:
-    """Returns the position of a site in its body's frame: (3,) [m]."""
-    return model.site_pos[object_id(model, mujoco.mjtObj.mjOBJ_SITE, name)].copy()
+    """Returns the position of a site: (3,) [m], in the world if it stands still, else in its body's frame."""
+    return _pos(model, "site", object_id(model, mujoco.mjtObj.mjOBJ_SITE, name))
 
 
 def site_size(model: mujoco.MjModel, name: str) -> np.ndarray:
@@ -238,8 +238,18 @@ def site_size(model: mujoco.MjModel, name: str) -> np.ndarray:
 
 
 def geom_pos(model: mujoco.MjModel, name: str) -> np.ndarray:
-    """Returns the position of a geom in its body's frame: (3,) [m]."""
-    return model.geom_pos[object_id(model, mujoco.mjtObj.mjOBJ_GEOM, name)].copy()
+    """Returns the position of a geom: (3,) [m], in the world if it stands still, else in its body's frame."""
+    return _pos(model, "geom", object_id(model, mujoco.mjtObj.mjOBJ_GEOM, name))
+
+
+def _pos(model: mujoco.MjModel, kind: str, index: int) -> np.ndarray:
+    """Returns the position (3,) of a "geom" or a "site", as `geom_pos` does."""
+    owner, whose = model, f"{kind}_pos"
+    body = getattr(model, f"{kind}_bodyid")[index]
+    if body and not _move(model, body):  # it stands still on a body with a frame of its own
+        owner, whose = mujoco.MjData(model), f"{kind}_xpos"
+        mujoco.mj_kinematics(model, owner)
+    return np.array(getattr(owner, whose)[index])
 
 
 def geom_positions(model: mujoco.MjModel, ids: list[int]) -> np.ndarray:
@@ -251,9 +261,13 @@ def geom_positions(model: mujoco.MjModel, ids: list[int]) -> np.ndarray:
 
 def geoms_move(model: mujoco.MjModel, ids: list[int]) -> bool:
     """Returns whether one of the geoms (k,) can move: by a joint, or with a mocap body."""
-    bodies = model.geom_bodyid[ids]
+    return bool(_move(model, model.geom_bodyid[ids]).any())
+
+
+def _move(model: mujoco.MjModel, bodies: np.ndarray) -> np.ndarray:
+    """Returns whether bodies (k,) can move: (k,) bool."""
     driven = model.body_mocapid[model.body_rootid[bodies]] >= 0
-    return bool((driven | (model.body_weldid[bodies] != 0)).any())
+    return np.asarray(driven | (model.body_weldid[bodies] != 0))
 
 
 def geom_size(model: mujoco.MjModel, name: str) -> np.ndarray:

@@ -34,8 +34,8 @@ class Plant:
         mocap: computes the poses of the mocap bodies from the positions of the joints, see
             `mjcf.mocap_poses`, at every physics step; by default they stay where the MJCF puts them.
         control: inner loop that computes the controls of all actuators from u and the true state, at every
-            physics step; they are clipped to each actuator's ctrlrange. `inputs` are then names of MJCF
-            numerics that hold the limits of u.
+            physics step; they are clipped to each actuator's ctrlrange, as MuJoCo does. `inputs` are then
+            names of MJCF numerics that hold the limits of u.
         steady: whether the inner loop depends on u alone, so that its controls hold for a whole sample.
 
     Raises:
@@ -69,15 +69,13 @@ class Plant:
         self.substeps = mjcf.substeps(model)
         self.low, self.high = input_limits(model, inputs, of_actuators=control is None)
         self._columns = [] if control else actuator_columns(model, inputs)
-        limited = model.actuator_ctrllimited.astype(bool)[:, None]
+        # MuJoCo clamps the other controls, unless its MJCF says no; without clamping it is done here.
+        clamps = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
+        limited = model.actuator_ctrllimited.astype(bool)[:, None] & clamps
         ranges = np.where(limited, model.actuator_ctrlrange, [-np.inf, np.inf])
         self._ctrl_low, self._ctrl_high = ranges.T
-        # MuJoCo clamps the other controls; without clamping it is done here.
-        self._held = np.zeros(model.nu)
-        if model.nkey:
-            clamps = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
-            held = model.key_ctrl[0]
-            self._held[:] = np.clip(held, self._ctrl_low, self._ctrl_high) if clamps else held
+        held = model.key_ctrl[0] if model.nkey else np.zeros(model.nu)
+        self._held = np.clip(held, self._ctrl_low, self._ctrl_high)
         self._unstable = np.zeros(n, dtype=bool)
         # Some sensors are read from the state; MuJoCo has to compute others after each step.
         self._columns_of_state = mjcf.state_columns(self.model)
@@ -331,8 +329,19 @@ class Plant:
 
 
 def actuator_columns(model: mujoco.MjModel, names: Sequence[str]) -> list[int]:
-    """Returns the ids of the named actuators, or raises `BadInput` with the names that the model has."""
-    return [mjcf.object_id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name) for name in names]
+    """Returns the columns of ctrl that the named actuators have.
+
+    Raises:
+        BadInput: the model has no such actuator, or one has several controls, as a pid or one on a ball may.
+    """
+    ids = [mjcf.object_id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name) for name in names]
+    for name, actuator in zip(names, ids, strict=True):
+        if (count := int(model.actuator_ctrlnum[actuator])) != 1:
+            raise BadInput(
+                f"actuator {name} of {mjcf.model_name(model)} has {count} controls, and an input is one: "
+                "give it a single one, or let the task's control() give them, with a numeric as the input"
+            )
+    return [int(model.actuator_ctrladr[actuator]) for actuator in ids]
 
 
 def input_limits(

@@ -169,7 +169,9 @@ def _played(
         data.ctrl[:] = model.key_ctrl[0]
         data.act[:] = model.key_act[0]
     loop = task.has_inner_loop
-    columns = [] if loop else [model.actuator(name).id for name in task.inputs]
+    columns = (
+        [] if loop else [model.actuator_ctrladr[model.actuator(name).id] for name in task.inputs]
+    )
     steps = mjcf.substeps(model)
     _move_mocap(task, model, data)
     sensed = [_sensed(model, data)]

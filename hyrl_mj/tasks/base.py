@@ -18,7 +18,7 @@ from hyrl_mj.physics.plant import Plant, input_limits
 from hyrl_mj.sets import Chart
 from hyrl_mj.tasks.description import Abilities, Effort, FullState, Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.guard import guard
-from hyrl_mj.tasks.motion import begins_anew, largest_moves
+from hyrl_mj.tasks.motion import begins_anew, ends_well, largest_moves
 from hyrl_mj.tasks.obstacles import (
     ANY,
     islands,
@@ -268,6 +268,11 @@ class Task(ABC):
         return largest_moves(self)
 
     @cached_property
+    def ends_well(self) -> bool:
+        """Whether `ending` calls some states REACHED, on the chart or beside it."""
+        return ends_well(self)
+
+    @cached_property
     def set_point(self) -> np.ndarray | None:
         """The goal, a chart point (d,), if it is a single one."""
         return None
@@ -333,7 +338,13 @@ class Task(ABC):
         return np.asarray(self.ending(self.placed(z).measurement) == Outcome.RUNNING)
 
     def verdict(self, measurement: np.ndarray) -> np.ndarray:
-        """Returns the `Outcome` (n,) int of episodes that still ran when they were truncated."""
+        """Returns the `Outcome` (n,) int of episodes that still ran when they were truncated.
+
+        By default those at the set-point are REACHED, and none where `ending` says which have arrived: before
+        its goal line a robot may be `close` by a `miss` that only looks to the side.
+        """
+        if self.ends_well:
+            return np.full(len(measurement), Outcome.STALLED)
         return np.where(self.arrived(self.z(measurement)), Outcome.REACHED, Outcome.STALLED)
 
     def arrived(self, z: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@
 import re
 from operator import attrgetter
 
+import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -38,7 +39,7 @@ COMPUTED = (
     "dt", "measurement_columns", "has_inner_loop", "gives_direction", "kinematic", "chart_is_state",
     "obstacles", "plant", "placed", "tabulating", "verify", "draw_inputs", "check_measurement", "check_noise",
     "at", "perturbed", "outcome", "failed", "goes_on", "noise_in_chart", "noise_on", "noisy_everywhere",
-    "with_noise", "with_sensor", "sensor_shares", "moves", "code", "spec",
+    "with_noise", "with_sensor", "sensor_shares", "moves", "ends_well", "input_levels", "code", "spec",
 )  # fmt: skip
 
 
@@ -220,6 +221,8 @@ def _check_starts(task: Task) -> None:
     if task.effort.everywhere:
         anywhere = task.chart.draw(task.effort.starts, np.random.default_rng(3))
         _check_round_trip(task, anywhere, task.z(task.placed(anywhere).measurement))
+    if type(task).plant is Task.plant:
+        _check_turns(task, np.vstack([z, task.chart.draw(STARTS, np.random.default_rng(4))]))
     ending = task.ending(measurement)
     over = np.flatnonzero(ending != Outcome.RUNNING)
     if len(over):
@@ -241,6 +244,31 @@ def _check_round_trip(
             f"{task.chart.format(back[worst])}; let them agree all over the chart, with sensors that do not "
             "clip there (cutoff)"
         )
+
+
+def _check_turns(task: Task, z: np.ndarray) -> None:
+    """Raises `BadInput` unless whole turns of periodic coordinates lead chart points (n, d) to themselves."""
+    chart, model = task.chart, task.model
+    data = mujoco.MjData(model)
+
+    def seen(z: np.ndarray) -> np.ndarray:
+        """Returns where all bodies are, how they are turned, and how an episode ends: (n, k)."""
+        plant, poses = task.placed(z), []
+        for qpos in plant.qpos:
+            mjcf.place(model, data, qpos, task.mocap)
+            poses.append(np.append(data.xpos, data.xmat))
+        return np.column_stack([poses, task.ending(plant.measurement)])
+
+    for axis in np.flatnonzero(chart.periodic):
+        turn = chart.sides * (np.arange(chart.dimension) == axis)
+        off = np.abs(seen(z + turn) - seen(z)).max(axis=1)
+        if off.max() > 1e-3:  # 3.1416 will do
+            raise BadInput(
+                f"its chart says that {chart.names[axis]} is periodic and comes back after "
+                f"{chart.sides[axis]:.6g} {chart.units[axis]}, but that much on from "
+                f"{chart.format(z[int(off.argmax())])} the robot is elsewhere or ends otherwise: let the "
+                "period be a whole turn, 2 pi for an angle in rad, or say that it is not periodic"
+            )
 
 
 def _check_inverse(task: Task, measurement: np.ndarray) -> None:
@@ -325,7 +353,8 @@ def _check_mocap(task: Task, qpos: np.ndarray) -> None:
 
 
 def _check_episodes(task: Task) -> None:
-    ends = np.append(trial.try_random(task), trial.try_extreme(task))
+    trial.try_random(task)
+    trial.try_extreme(task)
     trial.try_methods(task)
     trial.try_inputs(task)
     trial.try_control(task)
@@ -337,7 +366,7 @@ def _check_episodes(task: Task) -> None:
     arrived = task.arrived(z)
     # Where the end says which runs have arrived, any start may be as near to the set-point as they are.
     own = type(task).verdict is not Task.verdict
-    if np.mean(arrived) > 0.5 and not own and not (ends == Outcome.REACHED).any():
+    if np.mean(arrived) > 0.5 and not own and not task.ends_well:
         raise BadInput(
             f"{arrived.sum()} of {STARTS} starts already count as arrived, as "
             f"{task.chart.format(z[arrived][0])}: start elsewhere, or make `close` smaller"

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hyrl_mj.errors import BadInput
 from hyrl_mj.physics import mujoco_log
 from hyrl_mj.tasks.description import Outcome
 
@@ -21,6 +23,7 @@ ALIKE = 1e-3
 ROUNDING = 1e-12  # of positions
 # Runs side by side, and the samples after which those that do not hold their input draw a new one.
 RUNS, HELD = 512, 8
+STATES = 4_000  # at which it is looked for ends that are a success
 # Moves come close to the largest one, and do not reach it: where it depends smoothly on the state, those of
 # thousands of samples fall short of it by less than this share.
 MARGIN = 1e-3
@@ -61,6 +64,19 @@ def begins_anew(task: Task, of_chart: bool = False) -> bool:
             hops.append(np.abs(hop)[goes_on])
     longest = np.concatenate(hops).max(axis=0)
     return bool((np.concatenate(off) <= ALIKE * longest + ROUNDING).all())
+
+
+def ends_well(task: Task) -> bool:
+    """Returns whether episodes end as a success somewhere on the chart, or up to a tenth of it beyond."""
+    rng, chart = np.random.default_rng(0), task.chart
+    beyond = np.where(chart.periodic, 0.0, chart.sides / 10)
+    for by in (0.0, beyond):
+        low, high = chart.origin - by, chart.origin + chart.sides + by
+        z = rng.uniform(low, high, (STATES, chart.dimension))
+        with suppress(BadInput):  # a robot may be nowhere beyond its chart
+            if (task.ending(task.placed(z).measurement) == Outcome.REACHED).any():
+                return True
+    return False
 
 
 def stands_still(task: Task) -> bool:

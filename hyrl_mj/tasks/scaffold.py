@@ -28,12 +28,20 @@ def write_task(name: str, folder: Path) -> list[Path]:
         what = "task" if name in task_names() else "Python package"
         raise BadInput(f"there is a {what} {name} already: choose another name")
     title = "".join(part.capitalize() for part in name.split("_"))
-    texts = {
-        folder / path.name.replace("my_robot", name): path.read_text(encoding="utf-8")
-        .replace("my_robot", name)
-        .replace("MyRobot", title)
+    sources = {
+        path.name: path.read_text(encoding="utf-8")
         for path in sorted(TEMPLATES.iterdir())
         if path.is_file()
+    }
+    if title in re.findall(r"\w+", "".join(sources.values()).replace("MyRobot", "")):
+        raise BadInput(
+            f"the files of a task have another use for the word {title}: choose another name"
+        )
+    texts = {
+        folder / path.replace("my_robot", name): text.replace("my_robot", name).replace(
+            "MyRobot", title
+        )
+        for path, text in sources.items()
     }
     if existing := [path for path in texts if path.exists() or path.is_symlink()]:
         raise BadInput(f"{existing[0]} exists already: choose another name, or another folder")

@@ -197,7 +197,11 @@ def try_place(task: Task) -> None:
     rng = np.random.default_rng(0)
     plant = task.placed(z := task.chart.draw(STARTS, rng), rng)
     where, number = mjcf.point_of(model, tracked)
-    moves = np.flatnonzero(model.body_weldid[model.geom_bodyid] != 0)
+    owner = {"site_xpos": model.site_bodyid, "geom_xpos": model.geom_bodyid}.get(where)
+    root = model.body_rootid[number if owner is None else owner[number]]
+    moves = (model.body_weldid[model.geom_bodyid] != 0) & (
+        model.body_rootid[model.geom_bodyid] == root
+    )
     data, places, reach = mujoco.MjData(model), [], 0.0
     for qpos in plant.qpos:
         mjcf.place(model, data, qpos, task.mocap)

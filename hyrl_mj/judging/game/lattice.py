@@ -15,7 +15,6 @@ from hyrl_mj.judging.game.resolution import (
     MOST_TRANSITIONS,
     lattice_grid,
     level_counts,
-    longest,
     probed_hops,
     resolves,
     transitions,
@@ -67,8 +66,7 @@ class Lattice(Places):
     walls that stop the robot, that would lose every run. There a sample leads to one of these nodes, drawn so
     that it is right on average, and the game is an estimate. No sample leads to a node inside of such a wall.
 
-    Nodes at which an episode that is cut off is a success have arrived, too, if the task has a `verdict` of
-    its own or its episodes never end as a success.
+    Nodes at which an episode that is cut off is a success (`Task.verdict`) have arrived, too.
 
     Attributes:
         task: the robot and its problem.
@@ -192,10 +190,7 @@ class Lattice(Places):
             fails = task.failed(measurement) | ~task.chart.contains(z) & ~arrives
             ends.add(a, alive, z, np.select([fails, arrives], [len(nodes) + 1, len(nodes)], -1))
         after = ends.after
-        ends_well = arrived.any() or (after == len(nodes)).any() or _ends_well(task)
-        # Then to be near the set-point is not enough, unless the task says so.
-        if not ends_well or type(task).verdict is not Task.verdict:
-            arrived |= ~failed & (task.verdict(plant.measurement) == Outcome.REACHED)
+        arrived |= ~failed & (task.verdict(plant.measurement) == Outcome.REACHED)
         return Lattice(arrived, failed, running, task, grid, levels, after, hops, uneven, direct)
 
     def level_of(self, u: np.ndarray) -> np.ndarray:
@@ -230,16 +225,6 @@ def nearest_of(grid: Nodes, mask: np.ndarray) -> np.ndarray:
     """Returns the nearest node of a mask (N,) bool to each node: (N,) int."""
     of_mask = np.flatnonzero(mask)
     return np.asarray(of_mask[grid.chart.nearest(grid.nodes[of_mask], grid.nodes)[1]])
-
-
-def _ends_well(task: Task) -> bool:
-    """Returns whether some episode ends as a success, in the chart or one sample beyond."""
-    chart, rng = task.chart, np.random.default_rng(0)
-    beyond = np.where(chart.periodic, 0.0, longest(probed_hops(task)))
-    z = rng.uniform(chart.low - beyond, chart.high + beyond, (20_000, chart.dimension))
-    plant = task.plant(len(z))
-    plant.set_state(*task.state(z))
-    return bool((task.ending(plant.measurement) == Outcome.REACHED).any())
 
 
 def _one_sample_on(
