@@ -82,7 +82,7 @@ def worst_case(
         curve, profile = _known(bounds, scores), Profile((), dict.fromkeys(names, ()))
         sensed = {}
     else:
-        coarse = Game(task, parts, controllers, LARGEST, everywhere, curve_grid(task, cells))
+        coarse = Game(task, parts, controllers, largest, everywhere, curve_grid(task, cells))
         of_coarse = Certificate.certify(coarse, controllers)
         curve, profile = _sweep(of_coarse, names, points)
         sensed = _sensed(task, bounds[-1], (certificate, of_coarse))
@@ -137,7 +137,7 @@ def _sensed(
     if not (sensor.late or sensor.bounds(task)[1].any()):  # all of it is noise, drawn anew
         return {}
     for certificate in certificates:
-        if certificate.game.largest >= eps and (found := prove_under(certificate, sensor, eps)):
+        if found := prove_under(certificate, sensor, eps):
             return found
     return {}
 
