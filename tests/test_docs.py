@@ -45,7 +45,7 @@ def code(page):
 
 
 def test_the_readme_is_short():
-    assert len(texts[ROOT / "README.md"].splitlines()) <= 150
+    assert len(texts[ROOT / "README.md"].splitlines()) <= 120
 
 
 def test_six_terms_come_before_the_first_table():
