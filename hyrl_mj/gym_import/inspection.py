@@ -295,14 +295,14 @@ def _criterion(instance: Instance, info: Sequence[str]) -> Criterion:
                 f"name an entry of info; {met}"
             )
     model = instance.model
+    points = [(mjcf.point_of(model, a), mjcf.point_of(model, b)) for a, b in criterion.places]
     for place in dict.fromkeys(name for pair in criterion.places for name in pair):
-        there = mjcf.points_of(model, place)
-        if any(np.ptp([getattr(instance.data, kind)[i] for kind, i in there], axis=0) > 1e-6):
+        places = [getattr(instance.data, kind)[i] for kind, i in mjcf.points_of(model, place)]
+        if len(places) > 1 and (np.ptp(places, axis=0) > 1e-6).any():
             raise BadInput(
                 f"several things of {name} have the name {place}, in different places: say which, as in "
                 f'distance("body {place}", ...), of site, body and geom'
             )
-    points = [(mjcf.point_of(model, a), mjcf.point_of(model, b)) for a, b in criterion.places]
     return replace(criterion, points=tuple(points))
 
 
