@@ -21,9 +21,9 @@ from hyrl_mj.gym_import.specification import EnvironmentSpec
 from hyrl_mj.system import limits
 from hyrl_mj.tasks import Outcome
 
+Arrays = tuple[np.ndarray, ...]
 # Of so many runs that are judged one shows wrappers nothing but where the noise shows the robot.
 VEILED = 8
-Arrays = tuple[np.ndarray, ...]
 # Runs of a judgement that an environment plays, too, which goes on from episode to episode; all of them where
 # something outlasts its resets.
 LIVED = 16
@@ -160,29 +160,28 @@ class Stage:
         if self._fresh is None:
             self._fresh = self._new(real=False)
             self._fresh.reset()
-        fresh = self._fresh
         for i, run in enumerate(runs):
             # A time limit of its own would end a run that is simulated for longer.
             as_it_is = len(run.inputs) <= self.spec.max_steps
-
-            def judged(run: Played, noise: np.ndarray, as_it_is: bool = as_it_is) -> bool:
-                real = self._renewed(self._judges[as_it_is], as_it_is)
-                alike = judge(run, real, noise, fresh)
-                self._judges[as_it_is].append(real)
-                return alike
-
-            judged(run, run.noise)
+            self._judge(run, run.noise, as_it_is)
             if len(runs) > 1 and (i < LIVED or self._wears) and run.outcome != Outcome.UNSTABLE:
                 self._live(run, as_it_is)
             if not (self.spec.wrapped and run.noise.any()):
                 continue
-            if not judged(run, np.zeros_like(run.noise)):
+            if not self._judge(run, np.zeros_like(run.noise), as_it_is):
                 for part in _parts(run):
-                    judged(
-                        part, part.noise * (np.arange(len(part.noise)) < len(part.inputs))[:, None]
-                    )
+                    without_last = part.noise.copy()
+                    without_last[len(part.inputs) :] = 0.0
+                    self._judge(part, without_last, as_it_is)
             if i % VEILED == 0:
                 self._check_veiled(run)
+
+    def _judge(self, run: Played, noise: np.ndarray, as_it_is: bool) -> bool:
+        """Plays a run in a new environment, as `judge` does, which has its time limit or not."""
+        real = self._renewed(self._judges[as_it_is], as_it_is)
+        alike = judge(run, real, noise, self._fresh)
+        self._judges[as_it_is].append(real)
+        return alike
 
     def _check_veiled(self, run: Played) -> None:
         """Raises `BadInput` if wrappers read MuJoCo's state at another time than is known."""
