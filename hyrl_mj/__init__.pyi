@@ -22,7 +22,17 @@ from .judging import Verdict
 from .judging.game import Game, Robustness, Score
 from .learning import Settings
 from .physics import mjcf as mjcf
-from .pipeline import AgentOptions, RunOptions, SweepOptions, diagnose, robustify, run, sweep
+from .pipeline import (
+    AgentOptions,
+    CompareOptions,
+    RunOptions,
+    SweepOptions,
+    compare,
+    diagnose,
+    robustify,
+    run,
+    sweep,
+)
 from .policies import Controller, HybridController, MlpPolicy, Policy, from_callable, load_agent
 from .runs.directory import Run, load_run
 from .sets import Chart, StateSet
@@ -58,6 +68,7 @@ __all__ = [
     "BadArtifact",
     "BadInput",
     "Chart",
+    "CompareOptions",
     "Controller",
     "CriticalSet",
     "ExtendedSets",
@@ -89,6 +100,7 @@ __all__ = [
     "Task",
     "Verdict",
     "closed_loop",
+    "compare",
     "diagnose",
     "export_numpy",
     "export_onnx",

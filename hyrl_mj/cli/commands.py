@@ -13,13 +13,20 @@ from hyrl_mj.fields import DriveOptions, exported_controller
 from hyrl_mj.files import trust
 from hyrl_mj.gym_import import EnvironmentOptions, chosen_task, explained
 from hyrl_mj.judging import Word
-from hyrl_mj.pipeline import AgentOptions, ExamineOptions, RunOptions, SweepOptions
+from hyrl_mj.pipeline import AgentOptions, CompareOptions, ExamineOptions, RunOptions, SweepOptions
 from hyrl_mj.policies import AnyPolicy, agent_at
 from hyrl_mj.runs.arcs import noisy_arcs
 from hyrl_mj.runs.directory import Run
 from hyrl_mj.simulation import noise_from_log
 from hyrl_mj.tasks import Task, get_task, task_names, write_task
-from hyrl_mj.viz import ReplayOptions, print_noise, print_robustness, print_summary, print_sweep
+from hyrl_mj.viz import (
+    ReplayOptions,
+    print_compared,
+    print_noise,
+    print_robustness,
+    print_summary,
+    print_sweep,
+)
 
 
 def list_tasks() -> None:
@@ -146,6 +153,27 @@ def sweep(
     print(f"tables in {folder}/sweep.html, sweep.csv and sweep.json")
     if any(not row.done or row.verdict == Word.FAILED for row in result.rows):
         raise SystemExit(1)
+
+
+def compare(
+    task: str | None = None, *, environment: EnvironmentOptions, options: CompareOptions
+) -> None:
+    """Compare HyRL with what people would do instead, judged alike.
+
+    Training under noise, memory, filters, held inputs and others: each is tuned, and may train with as many
+    samples as the whole run of HyRL. What is done is not done again.
+
+    Args:
+        task: a task, see `hyrl-mj list`, or a Python file that defines one; by default none, with --env.
+    """
+    chosen = chosen_task(task, environment)
+    if environment.explain:
+        print(explained(chosen))
+        return
+    result = pipeline.compare(chosen, options)
+    print_compared(result)
+    folder = options.out or Path("runs") / f"{chosen.name}_compare"
+    print(f"page at {folder}/compare.html")
 
 
 def stage_command(name: str, help_text: str) -> Callable[..., None]:
@@ -428,6 +456,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "robustify": robustify,
     "diagnose": diagnose,
     "sweep": sweep,
+    "compare": compare,
     "train": stage_command("train", "Run stage 1 again: train the policy."),
     "critical-set": stage_command("critical-set", "Run stage 2 again: find the critical set."),
     "partition": stage_command("partition", "Run stage 3 again: partition the chart."),

@@ -87,6 +87,7 @@ class Subject:
         effort: what may be spent.
         attacks: what signals an attack tries.
         alike: whether all of them answer as the controller "policy" does.
+        curves: whether the game also tells margins, and what is won at all bounds.
     """
 
     task: Task
@@ -101,6 +102,7 @@ class Subject:
     effort: Effort
     attacks: AttackSettings = AttackSettings()
     alike: bool = False
+    curves: bool = True
 
 
 @dataclass(frozen=True)
@@ -148,8 +150,9 @@ def examine(
     if subject.playable:
         bounds = tuple(dict.fromkeys((0.0, eps / 2, eps)))
         game, maps = worst_case(
-            task, points, subject.parts, subject.controllers, bounds, everywhere, subject.cells
-        )
+            task, points, subject.parts, subject.controllers, bounds, everywhere, subject.cells,
+            subject.curves,
+        )  # fmt: skip
     regions = Regions(points, _winnable(subject, maps), options.near_critical)
     episodes = NoisyEpisodes((), ())
     if count is not None:

@@ -53,6 +53,7 @@ def worst_case(
     bounds: tuple[float, ...],
     everywhere: bool = False,
     cells: int = 0,
+    curves: bool = True,
 ) -> tuple[GameResult, Maps]:
     """Plays the game: scores at some noise bounds, margins, the curve over all bounds, and the maps.
 
@@ -66,18 +67,20 @@ def worst_case(
         cells: number of lattice cells along the longest side of the chart, as in `lattice_grid`. The curve is
             computed with no more than `CURVE_CELLS`; where the game is an estimate it goes through the
             scores, and there are no margins.
+        curves: whether there are margins and a curve; without them the curve goes through the scores, too.
     """
     Lattice.check(task)
     parts, grid = tuple(parts), lattice_grid(task, cells)
     Lattice.check(task, grid)
     exact = Lattice.decides(task, grid) and not why_no_cells(task, grid.counts)
-    largest = max(*bounds, LARGEST) if exact else max(bounds)
+    curves = curves and exact  # a coarser lattice would estimate nothing
+    largest = max(*bounds, LARGEST) if curves else max(bounds)
     fine = Game(task, parts, controllers, largest, everywhere, grid)
     names = [*controllers, LIMIT]
     certificate = Certificate.certify(fine, controllers)
     scores, maps = _scores(certificate, names, controllers, bounds)
     replays = _replays(certificate, controllers, scores)
-    if not exact:  # a coarser lattice would estimate nothing
+    if not curves:
         coarse, margins = fine, dict.fromkeys(controllers)
         curve, profile = _known(bounds, scores), Profile((), dict.fromkeys(names, ()))
         sensed = {}

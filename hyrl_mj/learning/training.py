@@ -29,7 +29,7 @@ from hyrl_mj.policies import (
     algorithms,
     infer_algorithm,
 )
-from hyrl_mj.simulation import Noise
+from hyrl_mj.simulation import AnyNoise, Noise
 from hyrl_mj.system.progress import progress_bar
 from hyrl_mj.tasks import Outcome, Task
 
@@ -48,7 +48,7 @@ class Ground(Protocol):
         settled: share of the training after which scores count.
     """
 
-    noise: Noise
+    noise: AnyNoise
     enough: Score
     settled: float
 
@@ -113,7 +113,7 @@ def build(
     settings: Training,
     seed: int,
     *,
-    noise: Noise | None = None,
+    noise: AnyNoise | None = None,
     domain: Domain | None = None,
     start_from: MlpPolicy | None = None,
 ) -> BaseAlgorithm:
@@ -284,7 +284,7 @@ class TaskGround:
     return. Some of the training's episodes start anywhere, as its settings of `rehearse` say.
     """
 
-    noise = Noise()
+    noise: AnyNoise = Noise()
     enough: Score = (np.inf,)
     settled = 0.5  # an untrained policy can score well by chance
 

@@ -10,7 +10,7 @@ from hyrl_mj.learning import ModeSettings
 from hyrl_mj.learning.training import Score
 from hyrl_mj.policies import MlpPolicy, Policy
 from hyrl_mj.sets import GridSet
-from hyrl_mj.simulation import AttackSettings
+from hyrl_mj.simulation import AnyNoise, AttackSettings
 from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.judges import (
     Attacked,
@@ -85,7 +85,8 @@ class ModeGround:
     ):
         self.states, self.judge, self.part, self.settings = states, judge, part, settings
         self.task, self.mode = states.task, states.mode
-        self.noise, self.enough, self.settled = judge.noise, judge.enough, judge.settled
+        self.noise: AnyNoise = judge.noise
+        self.enough, self.settled = judge.enough, judge.settled
         self._latest: tuple[Policy, Judged] | None = None
 
     def note_losses(self, policy: Policy) -> None:

@@ -5,6 +5,7 @@ matplotlib, Pillow or a GL library, so they are imported only where they are nee
 """
 
 from hyrl_mj.viz.commands import beginning
+from hyrl_mj.viz.compared_tables import print_compared
 from hyrl_mj.viz.options import ReplayOptions
 from hyrl_mj.viz.sweep_tables import print_sweep
 from hyrl_mj.viz.tables import replay_sentence, robustness_sentence
@@ -13,10 +14,12 @@ from hyrl_mj.viz.terminal import print_noise, print_robustness, print_summary
 __all__ = [
     "ReplayOptions",
     "beginning",
+    "compared_page",
     "diagnosis",
     "drives",
     "encoding",
     "figures",
+    "print_compared",
     "print_noise",
     "print_robustness",
     "print_summary",

@@ -58,14 +58,14 @@ def _pictures(sweep: Sweep, folder: Path) -> Iterator[Picture]:
         if game is not None:
             curves.setdefault(row.setting, []).append(game.curve)
     if curves:
-        yield _as_picture(
+        yield as_picture(
             "curves",
             draw_curves(curves),
             "What is won of the winnable starts against the worst noise of up to a bound: the line is the "
             "median over the seeds, the band reaches from the least to the greatest.",
         )
     if (profiles := draw_profiles(sweep)) is not None:
-        yield _as_picture(
+        yield as_picture(
             "profiles",
             profiles,
             "Performance profiles: the share of the runs of the sweep, over all settings and seeds, in which "
@@ -73,7 +73,8 @@ def _pictures(sweep: Sweep, folder: Path) -> Iterator[Picture]:
         )
 
 
-def _as_picture(name: str, figure: Figure, caption: str) -> Picture:
+def as_picture(name: str, figure: Figure, caption: str) -> Picture:
+    """Returns a figure as a picture of a page."""
     content = BytesIO()
     figure.savefig(content, format="png", dpi=style.DPI, bbox_inches="tight", pad_inches=style.PAD)
     with Image.open(content) as image:

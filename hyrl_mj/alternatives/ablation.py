@@ -1,0 +1,88 @@
+"""HyRL's parts alone: hysteresis without retraining, and retraining without hysteresis."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from hyrl_mj.alternatives.base import Alternative, Candidate, Given, Unfit, register
+from hyrl_mj.policies import HybridController, PolicyController
+from hyrl_mj.sets import GridSet
+from hyrl_mj.stages import ExtendedSets, HeldInputs, Partition, part_policy, table_for
+
+
+@register
+class HysteresisAlone(Alternative):
+    """HyRL without stage 6."""
+
+    name = "hysteresis"
+    title = "hysteresis alone"
+    sentence = "HyRL's sets; each mode continues what the policy of stage 1 decides on its part."
+
+    def candidates(self, given: Given) -> Iterator[Candidate]:
+        run, task = given.run, given.task
+        if len(run.extended_sets.modes) < 2:
+            raise Unfit("the run has one mode, so that nothing is switched")
+        own = run.controller
+        policies = {
+            q: part_policy(task, run.steady, run.partition, q, given.eps) for q in own.modes
+        }
+        yield Candidate(
+            "stages 1 to 5", HybridController(task, policies, own.flow_sets, own.starts)
+        )
+
+
+def one_mode(given: Given) -> tuple[ExtendedSets, Partition]:
+    """Returns the sets and the partition of a single mode, which is the whole chart."""
+    grid = given.run.extended_sets.sets[0].grid
+    everywhere = np.ones(len(grid.nodes), dtype=bool)
+    whole = GridSet.from_mask(grid, everywhere)
+    d = given.task.chart.dimension
+    sets = ExtendedSets(
+        (0,), (whole,), (everywhere,), 0.0, given.eps, np.empty((0, d)), np.empty(0)
+    )
+    return sets, Partition((0,), (whole,), everywhere)
+
+
+@register
+class RetrainingAlone(Alternative):
+    """HyRL without modes."""
+
+    name = "retraining"
+    title = "stage 6 alone"
+    sentence = "One policy for all of the chart, trained as stage 6 trains those of modes, without a switch."
+
+    def candidates(self, given: Given) -> Iterator[Candidate]:
+        from hyrl_mj.stages.grounds import mode_ground
+        from hyrl_mj.stages.retraining import retrain
+
+        task, s = given.task, given.run.settings
+        if task.for_mode(0) is not task:
+            raise Unfit("the task has a reward for each mode, and one policy has no mode")
+        sets, parts = one_mode(given)
+        ground = mode_ground(task, sets, 0, parts, given.run.steady, False, s.modes, s.attack)
+        policy, result = retrain(ground, s.stage6, given.seed)
+        samples = result.attempts * s.stage6.samples
+        yield Candidate("all of the chart", PolicyController(policy), samples)
+
+
+@register
+class TableAlone(Alternative):
+    """A table without modes."""
+
+    name = "table"
+    title = "table without modes"
+    sentence = (
+        "One table of inputs for all of the chart, made as those of modes that stage 6 may make."
+    )
+
+    def candidates(self, given: Given) -> Iterator[Candidate]:
+        sets, _ = one_mode(given)
+        held = HeldInputs.from_sets(given.task, sets, given.run.settings.table)
+        if held is None:
+            raise Unfit(
+                "a table takes a chart of at most two dimensions, few inputs, and an arrival that ends the "
+                "episode"
+            )
+        yield Candidate("all of the chart", PolicyController(table_for(held, 0)))

@@ -1,0 +1,224 @@
+"""What people would do instead of HyRL, made and judged beside it."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hyrl_mj.errors import BadInput, unknown
+from hyrl_mj.files.manifest import locked
+from hyrl_mj.judging import Budget, ExamineOptions, attack, examine
+from hyrl_mj.judging.game import Game, Robustness, curve_grid, percent
+from hyrl_mj.learning import setting_value
+from hyrl_mj.pipeline.runs import RunOptions, complete, run, settings_of, usable_task
+from hyrl_mj.pipeline.steps import subject_of
+from hyrl_mj.policies import Controller, is_memory, memory_at_start
+from hyrl_mj.runs import compared
+from hyrl_mj.runs.compared import Compared, Row
+from hyrl_mj.runs.directory import Run
+from hyrl_mj.simulation import LoopSettings, Noise, closed_loop
+from hyrl_mj.system.progress import Say
+from hyrl_mj.tasks import Task, reference
+
+# Starts, and rounds of the attack, by which a setting is chosen where no game can be played.
+CHOICE_STARTS, CHOICE_ROUNDS = 128, 3
+# Episodes from which the distance to the set-point and the variation of inputs are measured.
+EPISODES = 1_000
+
+
+@dataclass(frozen=True)
+class CompareOptions:
+    """The options of a comparison.
+
+    Attributes:
+        eps: bound of the measurement noise, in the units of the chart.
+        seeds: seeds of the runs, as 0-4: a run of HyRL and one of each alternative for each.
+        preset: fast, paper or smoke, as for `hyrl-mj run`.
+        set: settings of the runs to change, as for `hyrl-mj run`; by default none.
+        only: names of alternatives, as held,recurrent; by default all. The policy of stage 1 and HyRL always
+            stand beside them.
+        out: the folder of the comparison; by default runs/TASK_compare.
+    """
+
+    eps: float = 0.1
+    seeds: tuple[int, ...] = (0,)
+    preset: str = "fast"
+    set: dict[str, Any] = field(default_factory=dict)
+    only: tuple[str, ...] = ()
+    out: str | Path | None = None
+
+
+def compare(
+    task: str | Path | Task,
+    options: CompareOptions | None = None,
+    *,
+    say: Say = print,
+    **changes: Any,
+) -> Compared:
+    """Compares HyRL with what people would do instead: makes each alternative, tunes it, and judges it.
+
+    Each alternative may train with as many samples as the whole run of HyRL took. All are judged alike, by
+    the same starts, noise and attack. What is done is not done again.
+
+    Args:
+        task: as for `run`.
+        options: the options, by default `CompareOptions()`.
+        say: receives a line about each alternative.
+        changes: fields of the options to change.
+
+    Raises:
+        BadInput: a value that cannot be used, or a folder that holds something else.
+    """
+    from hyrl_mj.alternatives import ALTERNATIVES
+    from hyrl_mj.viz.compared_page import write_page
+
+    options = complete(CompareOptions, options, changes)
+    task = usable_task(task)
+    for name in options.only:
+        if name not in ALTERNATIVES:
+            raise unknown("alternative", name, ALTERNATIVES)
+    chosen = [n for n in ALTERNATIVES if not options.only or n in (*options.only, "policy", "hyrl")]
+    if not options.seeds:
+        raise BadInput("a comparison needs at least one seed: give one or more")
+    folder = Path(options.out or Path("runs") / f"{task.name}_compare")
+    common = RunOptions(eps=options.eps, preset=options.preset, set=options.set)
+    of_runs = [replace(common, seed=s, out=folder / f"hyrl-{s}") for s in options.seeds]
+    for one in of_runs:  # a wrong value is reported before the work
+        settings_of(task, one)
+    changed = {name: setting_value(value) for name, value in options.set.items()}
+    lasting = task.abilities.arrival_ends
+    fresh = Compared(reference(task), options.eps, options.preset, changed, lasting)
+    compared.opened(folder, fresh)
+    with locked(folder):
+        found = compared.opened(folder, fresh)
+        for seed, one in zip(options.seeds, of_runs, strict=True):
+            open_ = [n for n in chosen if (r := found.row(n, seed)) is None or r.state == "open"]
+            if not open_:
+                say(f"seed {seed}: done before")
+                continue
+            made = run(task, one, say=lambda text: say(f"hyrl: {text}"))
+            for name in open_:
+                row = judged(made, name, seed)
+                found = found.with_row(row)
+                found.save(folder)
+                say(_told(row))
+        write_page(found, folder)
+    return found
+
+
+def _told(row: Row) -> str:
+    """Returns a line about a row."""
+    if row.state == "unfit":
+        return f"{row.name}: {row.sentence}"
+    shares = {"under attack": row.figures.get("worst"), "in the game": row.figures.get("won")}
+    won = " and ".join(f"{percent(v, False)} {how}" for how, v in shares.items() if v is not None)
+    return f"{row.name}: {row.title}, {row.sentence}, wins {won} ({row.seconds:.0f} s)"
+
+
+def judged(made: Run, name: str, seed: int) -> Row:
+    """Returns the row of an alternative: the best of its settings, judged as HyRL is."""
+    from hyrl_mj.alternatives import ALTERNATIVES, Given, Unfit
+
+    alternative, began = ALTERNATIVES[name], time.monotonic()
+    row = Row(name, alternative.title, seed)
+    try:
+        candidates = [*alternative.candidates(Given(made, seed))]
+    except Unfit as error:
+        return replace(row, state="unfit", sentence=str(error))
+    one = len(candidates) == 1
+    scores = [0.0 if one else _worst(made, each.controller, seed) for each in candidates]
+    best = candidates[int(np.argmax(scores))]
+    seconds = time.monotonic() - began
+    return replace(
+        row,
+        state="done",
+        sentence=best.label,
+        tried={} if one else dict(zip([c.label for c in candidates], scores, strict=True)),
+        samples=best.samples,
+        seconds=seconds,
+        figures=figures_of(made, best.controller, seed),
+    )
+
+
+def _playable(made: Run, controller: Controller) -> bool:
+    """Returns whether the worst-case game can be played against a controller."""
+    return made.why_no_game is None and not is_memory(memory_at_start(controller, 1))
+
+
+def _worst(made: Run, controller: Controller, seed: int) -> float:
+    """Returns the share of starts that a controller wins in the worst case that is found soon.
+
+    That is the game on the lattice of the curve where it can be played, else a short attack from other
+    starts than those of the examination. By this settings are chosen.
+    """
+    task, s = made.task, made.settings
+    if _playable(made, controller):
+        grid = curve_grid(task, s.lattice)
+        game = Game(task, made.split, {"one": controller}, s.eps, s.everywhere, grid)
+        return game.score("one", s.eps).won
+    starts = task.starts(CHOICE_STARTS, np.random.default_rng([seed, 2]))
+    budget = Budget(rounds=CHOICE_ROUNDS)
+    found = attack(task, {"one": controller}, starts, s.eps, budget, s.everywhere, seed, s.attack)
+    count = found["one"].count
+    return 1 - (count.lost + count.unaided) / count.starts
+
+
+def figures_of(made: Run, controller: Controller, seed: int) -> dict[str, float]:
+    """Returns what an examination says of a controller, by name.
+
+    These are: of the winnable starts the shares `proved`, and not `won` by any noise that is known
+    (`won_quiet` without noise), where the game can be played; of all starts that are attacked the shares
+    `worst`, won whatever the attack tried, and `lost_quiet`, lost without noise; of those that are won
+    without noise the shares `reached` under each kind of noise, and `late` under the worst of them; `miss`
+    [chart units], the median distance from the set-point at the end under uniform noise; and `variation`,
+    how far inputs go in a second there, as multiples of their range (median).
+    """
+    subject = replace(
+        subject_of(made, {"one": controller}, made.split),
+        playable=_playable(made, controller),
+        curves=False,
+    )
+    effort = subject.effort
+    options = ExamineOptions(
+        episodes=effort.episodes, attack_starts=effort.attack_starts, seed=1_000 + seed
+    )
+    budget = Budget(rounds=effort.attack_rounds)
+    result = examine(subject, options, budget).robustness
+    return {**_shares(result), **_manners(made, controller, seed)}
+
+
+def _shares(result: Robustness) -> dict[str, float]:
+    """Returns shares of starts from an examination of one controller."""
+    found: dict[str, float] = {}
+    if (game := result.game) is not None:
+        quiet, last = (game.scores["one"][i] for i in (0, -1))
+        found |= {"winnable": last.winnable, "won": last.not_broken, "won_quiet": quiet.not_broken}
+        if last.proved is not None:
+            found["proved"] = last.proved
+    for count in result.attacks:
+        found["lost_quiet"] = count.unaided / count.starts
+        found["worst"] = 1 - (count.lost + count.unaided) / count.starts
+    for one in result.comparisons:
+        if one.compared:
+            found[f"reached_{one.noise}"] = 1 - one.lost["one"] / one.compared
+            found["late"] = max(found.get("late", 0.0), one.late["one"] / one.compared)
+    return found
+
+
+def _manners(made: Run, controller: Controller, seed: int) -> dict[str, float]:
+    """Returns how runs under uniform noise end, and how much their inputs vary."""
+    task, s = made.task, made.settings
+    z0 = task.starts(EPISODES, np.random.default_rng([seed, 3]))
+    settings = LoopSettings(record=True, states=False, quiet=True)
+    noise = Noise("uniform", s.eps, s.everywhere)
+    play = closed_loop(task, controller, z0, noise, seed=seed, settings=settings)
+    low, high = task.input_limits
+    moved = np.abs(np.diff(play.u, axis=0)) / (high - low)
+    seconds = np.maximum(play.length - 1, 1) * task.dt
+    variation = np.nansum(moved, axis=(0, 2)) / seconds
+    miss = task.miss(play.path[-1])
+    return {"miss": float(np.median(miss)), "variation": float(np.median(variation))}

@@ -1,0 +1,108 @@
+"""The results of a comparison with what people would do instead, as tables and sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from hyrl_mj.judging.game import percent
+from hyrl_mj.runs.compared import Compared, Row
+from hyrl_mj.viz.tables import Table
+from hyrl_mj.viz.terminal import print_table
+
+# The figures in the table, with the headings of their columns and whether they are shares.
+COLUMNS = {
+    "worst": ("won under attack", True),
+    "won": ("won in the game", True),
+    "proved": ("proved", True),
+    "lost_quiet": ("lost without noise", True),
+    "late": ("late", True),
+    "miss": ("off the set-point", False),
+    "variation": ("variation of inputs [1/s]", False),
+}
+
+
+def ranked(compared: Compared) -> list[str]:
+    """Returns the names of the alternatives that have results, the best first."""
+    done = [name for name in compared.names if compared.of(name)]
+    return sorted(done, key=lambda name: [-_middle(compared, name, f) for f in ("worst", "won")])
+
+
+def _middle(compared: Compared, name: str, figure: str) -> float:
+    """Returns the mean of a figure over the seeds, -1 if there is none."""
+    values = compared.values(name, figure)
+    return float(np.mean(values)) if values else -1.0
+
+
+def result_table(compared: Compared) -> Table:
+    """Returns the results: a row for each alternative, the best first; means and ranges over the seeds."""
+    rows = []
+    for name in ranked(compared):
+        of = compared.of(name)
+        row = {"alternative": of[0].title, "setting": _settings(of)}
+        for figure, (heading, share) in COLUMNS.items():
+            if figure != "late" or compared.lasting:
+                row[heading] = _cell(compared.values(name, figure), share)
+        row["samples trained"] = f"{np.mean([r.samples for r in of]):,.0f}"
+        row["seconds"] = f"{np.mean([r.seconds for r in of]):.0f}"
+        rows.append(row)
+    return Table.of(f"{compared.task}: what would do instead, noise {compared.eps:g}", rows)
+
+
+def _settings(rows: list[Row]) -> str:
+    """Returns the settings that were taken, the most frequent first."""
+    taken = [row.sentence for row in rows]
+    return "; ".join(sorted(dict.fromkeys(taken), key=taken.count, reverse=True))
+
+
+def _cell(values: list[float], share: bool) -> str:
+    """Returns the mean of values, and their range if they differ."""
+    if not values:
+        return "-"
+    show = (lambda v: percent(v, surely=False)) if share else "{:.3g}".format
+    text, ends = show(float(np.mean(values))), (show(min(values)), show(max(values)))
+    return text if ends[0] == ends[1] else f"{text} ({ends[0]} to {ends[1]})"
+
+
+def tried_table(compared: Compared) -> Table | None:
+    """Returns by which share of starts each setting was chosen; None if there was nothing to choose."""
+    rows = []
+    for name in ranked(compared):
+        of = [row for row in compared.of(name) if row.tried]
+        for label in dict.fromkeys(label for row in of for label in row.tried):
+            won = [row.tried[label] for row in of if label in row.tried]
+            chosen = sum(row.sentence == label for row in of)
+            taken = f"{chosen} of {len(won)}"
+            rows.append([of[0].title, label, _cell(won, True), taken])
+    headings = ("alternative", "setting", "won when it was chosen", "taken, seeds")
+    return Table(f"{compared.task}: settings that were tried", headings, rows) if rows else None
+
+
+def sentences(compared: Compared) -> Iterator[str]:
+    """Yields how HyRL compares with the best alternative, and which ones could not be compared."""
+    others = [n for n in ranked(compared) if n not in ("hyrl", "policy")]
+    if others and compared.of("hyrl"):
+        best = others[0]
+        title, hyrl = compared.of(best)[0].title, compared.values("hyrl", "worst")
+        value, interval = compared.difference(best, "worst")
+        between = ""
+        if interval is not None:
+            low, high = (f"{100 * end:+.2f}" for end in interval)
+            between = f" (95% interval {low} to {high})"
+        word = "more" if value > 0 else "less" if value < 0 else "more or less"
+        yield (
+            f"The best alternative is {title}, which wins {_cell(compared.values(best, 'worst'), True)} of "
+            f"the starts under attack; HyRL wins {_cell(hyrl, True)}, "
+            f"{100 * abs(value):.2f} percentage points {word}{between}."
+        )
+    for row in compared.rows:
+        if row.state == "unfit":
+            yield f"{row.title}, seed {row.seed}: {row.sentence}."
+
+
+def print_compared(compared: Compared) -> None:
+    """Prints the results."""
+    print_table(result_table(compared))
+    for sentence in sentences(compared):
+        print(sentence)
