@@ -134,7 +134,7 @@ def test_a_kalman_filter_without_drift_averages_all_measurements(vehicle):
     memory = kalman.start(1)
     for k, error in enumerate(errors):
         true = vehicle.z(plant.measurement)
-        measured = vehicle.at(true + [[0.0, error]])
+        measured = vehicle.at(true + np.array([[0.0, error]]))
         u, memory = kalman.act_after(memory, measured)
         estimate = vehicle.z(noting.asked[-1])
         np.testing.assert_allclose(estimate - true, [[0, np.mean(errors[: k + 1])]], atol=1e-9)

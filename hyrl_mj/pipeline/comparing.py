@@ -14,7 +14,15 @@ from hyrl_mj.files.manifest import locked
 from hyrl_mj.judging import Budget, ExamineOptions, attack, examine
 from hyrl_mj.judging.game import Game, Robustness, curve_grid, percent
 from hyrl_mj.learning import setting_value
-from hyrl_mj.pipeline.runs import RunOptions, complete, run, settings_of, usable_task
+from hyrl_mj.pipeline.runs import (
+    RunOptions,
+    checked_seeds,
+    complete,
+    run,
+    settings_of,
+    several,
+    usable_task,
+)
 from hyrl_mj.pipeline.steps import subject_of
 from hyrl_mj.policies import Controller, is_memory, memory_at_start
 from hyrl_mj.runs import compared
@@ -50,6 +58,12 @@ class CompareOptions:
     set: dict[str, Any] = field(default_factory=dict)
     only: tuple[str, ...] = ()
     out: str | Path | None = None
+
+    def __post_init__(self) -> None:
+        changed = {name: setting_value(value) for name, value in self.set.items()}
+        values = {"seeds": checked_seeds(self.seeds), "only": several(self.only), "set": changed}
+        for name, value in values.items():
+            object.__setattr__(self, name, value)  # the dataclass is frozen
 
 
 def compare(
@@ -89,9 +103,8 @@ def compare(
     of_runs = [replace(common, seed=s, out=folder / f"hyrl-{s}") for s in options.seeds]
     for one in of_runs:  # a wrong value is reported before the work
         settings_of(task, one)
-    changed = {name: setting_value(value) for name, value in options.set.items()}
     lasting = task.abilities.arrival_ends
-    fresh = Compared(reference(task), options.eps, options.preset, changed, lasting)
+    fresh = Compared(reference(task), options.eps, options.preset, options.set, lasting)
     compared.opened(folder, fresh)
     with locked(folder):
         found = compared.opened(folder, fresh)

@@ -6,13 +6,15 @@ the end of an entry is the default that `--help` shows.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
-from hyrl_mj.errors import BadInput, unknown
+from hyrl_mj.errors import BadInput, check_seed, unknown
 from hyrl_mj.files.manifest import locked
 from hyrl_mj.judging import Arrivals
 from hyrl_mj.judging.game import LATTICE
@@ -20,6 +22,7 @@ from hyrl_mj.learning import Settings, Training, changed, preset
 from hyrl_mj.pipeline.steps import DIAGNOSIS, STAGES, extended_sets_stage, run_stage
 from hyrl_mj.policies import ALGORITHMS, FUNCTION, AnyPolicy, algorithms, read_agent
 from hyrl_mj.runs.directory import Run, load_run, opened, write_config
+from hyrl_mj.runs.sweeps import MOST_RUNS
 from hyrl_mj.sets import coarseness
 from hyrl_mj.simulation import Sensor, judge_task
 from hyrl_mj.system.progress import Say
@@ -118,6 +121,23 @@ def complete(kind: type[Options], options: Options | None, changes: dict[str, An
         if name not in names:
             raise unknown("option", name, names)
     return replace(options, **changes)  # type: ignore[type-var]
+
+
+def several(value: Any) -> tuple[Any, ...]:
+    """Returns some values, or the only one, as a tuple; raises `BadInput` for more than any sweep has."""
+    one = isinstance(value, str | Path) or not isinstance(value, Iterable)
+    values = (value,) if one else tuple(islice(value, MOST_RUNS + 1))
+    if len(values) > MOST_RUNS:
+        raise BadInput(f"at most {MOST_RUNS:,} runs are made: give fewer values")
+    return values
+
+
+def checked_seeds(seeds: Any) -> tuple[int, ...]:
+    """Returns seeds, or a single one, as a tuple; raises `BadInput` for one that is none or comes twice."""
+    checked = tuple(map(check_seed, several(seeds)))
+    if twice := [seed for seed, count in Counter(checked).items() if count > 1]:
+        raise BadInput(f"the seed {twice[0]} is given twice: give each seed once")
+    return checked
 
 
 def run(

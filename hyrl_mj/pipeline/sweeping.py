@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
-from itertools import islice, product
+from itertools import product
 from pathlib import Path
 from typing import Any
 
-from hyrl_mj.errors import BadInput, check_bound, check_seed
+from hyrl_mj.errors import BadInput, check_bound
 from hyrl_mj.files.manifest import locked
 from hyrl_mj.learning import setting_value
 from hyrl_mj.pipeline import cluster
 from hyrl_mj.pipeline.board import Board
-from hyrl_mj.pipeline.runs import RunOptions, complete, settings_of, usable_task
+from hyrl_mj.pipeline.runs import (
+    RunOptions,
+    checked_seeds,
+    complete,
+    settings_of,
+    several,
+    usable_task,
+)
 from hyrl_mj.ranges import Integer, Number
 from hyrl_mj.runs import sweeps
-from hyrl_mj.runs.sweeps import MOST_RUNS, Common, Row, Setting, Sweep
+from hyrl_mj.runs.sweeps import Common, Row, Setting, Sweep
 from hyrl_mj.system.progress import Say
 from hyrl_mj.tasks import reference
 
@@ -56,23 +62,14 @@ class SweepOptions:
     out: str | Path = Path("runs/sweep")
 
     def __post_init__(self) -> None:
-        several = {
-            "seeds": tuple(map(check_seed, _several(self.seeds))),
-            "eps": tuple(map(check_bound, _several(self.eps))),
-            "algorithm": _several(self.algorithm),
+        values = {
+            "seeds": checked_seeds(self.seeds),
+            "eps": tuple(map(check_bound, several(self.eps))),
+            "algorithm": several(self.algorithm),
             "set": {name: setting_value(value) for name, value in self.set.items()},
         }
-        for name, value in several.items():
+        for name, value in values.items():
             object.__setattr__(self, name, value)  # the dataclass is frozen
-
-
-def _several(value: Any) -> tuple[Any, ...]:
-    """Returns some values, or the only one, as a tuple; raises `BadInput` for more than any sweep has."""
-    one = isinstance(value, str | Path) or not isinstance(value, Iterable)
-    values = (value,) if one else tuple(islice(value, MOST_RUNS + 1))
-    if len(values) > MOST_RUNS:
-        raise BadInput(f"a sweep makes at most {MOST_RUNS:,} runs: give fewer values")
-    return values
 
 
 def sweep(
@@ -97,7 +94,7 @@ def sweep(
         BadInput: a value that cannot be used, a folder with another sweep, or a cluster that does not answer.
     """
     options = complete(SweepOptions, options, changes)
-    jobs = {row.name: (row, one) for row, one in _jobs(_several(tasks), options)}
+    jobs = {row.name: (row, one) for row, one in _jobs(several(tasks), options)}
     folder = Path(options.out)
     common = Common(options.preset, options.horizon, options.set, options.all_coordinates)
     planned = [row for row, _ in jobs.values()]
@@ -191,12 +188,10 @@ def _jobs(names: tuple[str | Path, ...], options: SweepOptions) -> Iterator[tupl
 
 
 def _check(names: tuple[str | Path, ...], options: SweepOptions) -> None:
-    """Raises `BadInput` if there is nothing to do, a seed is given twice, or a share is out of range."""
+    """Raises `BadInput` if there is nothing to do, or a share is out of range."""
     for what, values in (("task", names), ("seed", options.seeds), ("eps", options.eps)):
         if not values:
             raise BadInput(f"a sweep needs at least one {what}: give one or more")
-    if twice := [seed for seed, count in Counter(options.seeds).items() if count > 1]:
-        raise BadInput(f"the seed {twice[0]} is given twice: give each seed once")
     if options.cores is not None:
         Integer(1, 1_024).checked("cores", options.cores)
     Number(0, 10_000, above=True).checked("memory", options.memory)
