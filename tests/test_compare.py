@@ -3,6 +3,7 @@
 import json
 import shutil
 import sys
+from copy import copy
 from dataclasses import replace
 
 import gymnasium as gym
@@ -26,7 +27,7 @@ from hyrl_mj.alternatives.timer import TimerSupervisor, returns
 from hyrl_mj.alternatives.training import environment, learned
 from hyrl_mj.files import artifacts
 from hyrl_mj.learning.training import export
-from hyrl_mj.pipeline import comparing
+from hyrl_mj.pipeline import comparing, steps
 from hyrl_mj.policies import PolicyController, from_callable
 from hyrl_mj.runs.compared import Compared, Row
 from hyrl_mj.sets import Grid
@@ -41,8 +42,11 @@ RUNS = {"preset": "smoke", "set": FEW_CELLS}
 def given(planted_circle):
     """What alternatives may use of the planted run, with hardly any samples."""
 
+    few = copy(planted_circle[0].task)
+    few.effort = replace(few.effort, checkpoints=1)
+
     class Little(Given):
-        samples = 2_048
+        samples, task = 2_048, few
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(base, "TRIED", 8)
@@ -330,6 +334,8 @@ def small():
         patch.setattr(comparing, "CHOICE_STARTS", 16)
         patch.setattr(comparing, "CHOICE_ROUNDS", 1)
         patch.setattr(comparing, "EPISODES", 64)
+        little = replace(steps.SPARING, episodes=40, attack_starts=12, attack_rounds=1)
+        patch.setattr(steps, "SPARING", little)
         yield
 
 

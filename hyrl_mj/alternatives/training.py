@@ -98,6 +98,6 @@ class _Best(BaseCallback):
 
     def _judge(self) -> None:
         won = self._given.won(self._controller(self.model), JUDGED)
-        if won > self._won:
+        if won >= self._won:  # of equally good ones the latest
             tensors = self.model.policy.state_dict()
             self._won, self.state = won, {name: value.clone() for name, value in tensors.items()}
