@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import shlex
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,7 @@ from hyrl_mj.policies import AnyPolicy, agent_at
 from hyrl_mj.runs.arcs import noisy_arcs
 from hyrl_mj.runs.directory import Run
 from hyrl_mj.simulation import noise_from_log
+from hyrl_mj.system import cores
 from hyrl_mj.tasks import Task, get_task, task_names, write_task
 from hyrl_mj.viz import (
     ReplayOptions,
@@ -170,7 +173,10 @@ def compare(
     if environment.explain:
         print(explained(chosen))
         return
-    result = pipeline.compare(chosen, options)
+    # A fork would copy the threads of torch and MuJoCo in whatever state they are.
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(cores.count(), spawn) as pool, cores.using_pool(pool):
+        result = pipeline.compare(chosen, options)
     print_compared(result)
     folder = options.out or Path("runs") / f"{chosen.name}_compare"
     print(f"page at {folder}/compare.html")

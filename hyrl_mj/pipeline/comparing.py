@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from hyrl_mj.runs import compared
 from hyrl_mj.runs.compared import Compared, Row
 from hyrl_mj.runs.directory import Run
 from hyrl_mj.simulation import LoopSettings, Noise, closed_loop
+from hyrl_mj.system import cores
 from hyrl_mj.system.progress import Say
 from hyrl_mj.tasks import Task, reference
 
@@ -76,7 +78,8 @@ def compare(
     """Compares HyRL with what people would do instead: makes each alternative, tunes it, and judges it.
 
     Each alternative may train with as many samples as the whole run of HyRL took. All are judged alike, by
-    the same starts, noise and attack. What is done is not done again.
+    the same starts, noise and attack. What is done is not done again. With `using_pool` alternatives are made
+    side by side.
 
     Args:
         task: as for `run`.
@@ -114,8 +117,7 @@ def compare(
                 say(f"seed {seed}: done before")
                 continue
             made = run(task, one, say=lambda text: say(f"hyrl: {text}"))
-            for name in open_:
-                row = judged(made, name, seed)
+            for row in cores.in_processes(partial(judged, made, seed=seed), open_):
                 found = found.with_row(row)
                 found.save(folder)
                 say(_told(row))
@@ -132,7 +134,7 @@ def _told(row: Row) -> str:
     return f"{row.name}: {row.title}, {row.sentence}, wins {won} ({row.seconds:.0f} s)"
 
 
-def judged(made: Run, name: str, seed: int) -> Row:
+def judged(made: Run, name: str, *, seed: int) -> Row:
     """Returns the row of an alternative: the best of its settings, judged as HyRL is."""
     from hyrl_mj.alternatives import ALTERNATIVES, Given, Unfit
 

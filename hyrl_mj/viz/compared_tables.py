@@ -21,6 +21,7 @@ COLUMNS = {
     "miss": ("off the set-point", False),
     "variation": ("variation of inputs [1/s]", False),
 }
+BRIEF = ("worst", "won", "lost_quiet", "late")
 
 
 def ranked(compared: Compared) -> list[str]:
@@ -35,17 +36,23 @@ def _middle(compared: Compared, name: str, figure: str) -> float:
     return float(np.mean(values)) if values else -1.0
 
 
-def result_table(compared: Compared) -> Table:
-    """Returns the results: a row for each alternative, the best first; means and ranges over the seeds."""
+def result_table(compared: Compared, brief: bool = False) -> Table:
+    """Returns the results: a row for each alternative, the best first; means and ranges over the seeds.
+
+    A brief one, for terminals, holds what decides alone.
+    """
     rows = []
     for name in ranked(compared):
         of = compared.of(name)
-        row = {"alternative": of[0].title, "setting": _settings(of)}
+        row = {"alternative": of[0].title}
+        if not brief:
+            row["setting"] = _settings(of)
         for figure, (heading, share) in COLUMNS.items():
-            if figure != "late" or compared.lasting:
+            if (figure != "late" or compared.lasting) and (figure in BRIEF or not brief):
                 row[heading] = _cell(compared.values(name, figure), share)
-        row["samples trained"] = f"{np.mean([r.samples for r in of]):,.0f}"
-        row["seconds"] = f"{np.mean([r.seconds for r in of]):.0f}"
+        if not brief:
+            row["samples trained"] = f"{np.mean([r.samples for r in of]):,.0f}"
+            row["seconds"] = f"{np.mean([r.seconds for r in of]):.0f}"
         rows.append(row)
     return Table.of(f"{compared.task}: what would do instead, noise {compared.eps:g}", rows)
 
@@ -90,11 +97,13 @@ def sentences(compared: Compared) -> Iterator[str]:
         if interval is not None:
             low, high = (f"{100 * end:+.2f}" for end in interval)
             between = f" (95% interval {low} to {high})"
-        word = "more" if value > 0 else "less" if value < 0 else "more or less"
+        word = "as many" if not value else f"{100 * abs(value):.2f} percentage points "
+        if value:
+            word += "more" if value > 0 else "less"
         yield (
             f"The best alternative is {title}, which wins {_cell(compared.values(best, 'worst'), True)} of "
             f"the starts under attack; HyRL wins {_cell(hyrl, True)}, "
-            f"{100 * abs(value):.2f} percentage points {word}{between}."
+            f"{word}{between}."
         )
     for row in compared.rows:
         if row.state == "unfit":
@@ -103,6 +112,6 @@ def sentences(compared: Compared) -> Iterator[str]:
 
 def print_compared(compared: Compared) -> None:
     """Prints the results."""
-    print_table(result_table(compared))
+    print_table(result_table(compared, brief=True))
     for sentence in sentences(compared):
         print(sentence)
