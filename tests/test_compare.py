@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import VecFrameStack
 
 import hyrl_mj
 from hyrl_mj import BadInput
-from hyrl_mj.alternatives import ALTERNATIVES, Alternative, Candidate, Given, Unfit, base
+from hyrl_mj.alternatives import Alternative, Candidate, Given, Unfit, base, register, registered
 from hyrl_mj.alternatives.adversary import LearnedNoise, train_adversary
 from hyrl_mj.alternatives.filters import KalmanFilter, MovingAverage
 from hyrl_mj.alternatives.held import HeldInputs, HeldLevels
@@ -178,7 +178,7 @@ def test_a_frame_stack_sees_what_vec_frame_stack_shows(given):
 def test_recurrent_says_what_is_missing(given, monkeypatch):
     monkeypatch.setitem(sys.modules, "sb3_contrib", None)
     with pytest.raises(Unfit, match="pip install sb3-contrib"):
-        next(ALTERNATIVES["recurrent"].candidates(given))
+        next(registered()["recurrent"].candidates(given))
 
 
 # ---- smooth
@@ -380,7 +380,7 @@ def test_what_is_done_is_not_done_again(result, folder, monkeypatch):
 def test_a_file_makes_an_alternative_which_may_not_fit(result, folder, small, monkeypatch):
     monkeypatch.setattr(base, "_KNOWN", dict(base._KNOWN))
 
-    @base.register
+    @register
     class Never(Alternative):
         name, title, sentence = "never", "never", "It fits nothing."
 
@@ -388,7 +388,6 @@ def test_a_file_makes_an_alternative_which_may_not_fit(result, folder, small, mo
             yield Candidate("first", given.run.controllers["policy"])
             raise Unfit("nothing fits it")
 
-    monkeypatch.setitem(ALTERNATIVES, "never", base.registered()["never"])
     found = hyrl_mj.compare("unit_circle", out=folder, only=("never",), say=len, **RUNS)
     row = found.row("never", 0)
     assert (row.state, row.sentence) == ("unfit", "nothing fits it")

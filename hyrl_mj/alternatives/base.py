@@ -138,6 +138,6 @@ def register(kind: type[AnyAlternative]) -> type[AnyAlternative]:
 
 
 def registered() -> dict[str, Alternative]:
-    """Returns all alternatives by name, the two that are always compared first."""
+    """Returns all alternatives by name, in the order of their making: first those of the run itself."""
     first = ("policy", "hyrl")
     return {name: _KNOWN[name] for name in (*first, *(n for n in sorted(_KNOWN) if n not in first))}

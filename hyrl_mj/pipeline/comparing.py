@@ -90,15 +90,15 @@ def compare(
     Raises:
         BadInput: a value that cannot be used, or a folder that holds something else.
     """
-    from hyrl_mj.alternatives import ALTERNATIVES
+    from hyrl_mj.alternatives import registered
     from hyrl_mj.viz.compared_page import write_page
 
-    options = complete(CompareOptions, options, changes)
+    options, known = complete(CompareOptions, options, changes), registered()
     task = usable_task(task)
     for name in options.only:
-        if name not in ALTERNATIVES:
-            raise unknown("alternative", name, ALTERNATIVES)
-    chosen = [n for n in ALTERNATIVES if not options.only or n in (*options.only, "policy", "hyrl")]
+        if name not in known:
+            raise unknown("alternative", name, known)
+    chosen = [n for n in known if not options.only or n in (*options.only, "policy", "hyrl")]
     if not options.seeds:
         raise BadInput("a comparison needs at least one seed: give one or more")
     folder = Path(options.out or Path("runs") / f"{task.name}_compare")
@@ -136,9 +136,9 @@ def _told(row: Row) -> str:
 
 def judged(made: Run, name: str, *, seed: int) -> Row:
     """Returns the row of an alternative: the best of its settings, judged as HyRL is."""
-    from hyrl_mj.alternatives import ALTERNATIVES, Given, Unfit
+    from hyrl_mj.alternatives import Given, Unfit, registered
 
-    alternative, began = ALTERNATIVES[name], time.monotonic()
+    alternative, began = registered()[name], time.monotonic()
     row = Row(name, alternative.title, seed)
     try:
         candidates = [*alternative.candidates(Given(made, seed))]
