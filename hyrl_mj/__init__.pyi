@@ -1,4 +1,5 @@
 from . import (
+    alternatives as alternatives,
     export as export,
     fields as fields,
     gym_export as gym_export,

@@ -91,7 +91,8 @@ def sentences(compared: Compared) -> Iterator[str]:
     others = [n for n in ranked(compared) if n not in ("hyrl", "policy")]
     if others and compared.of("hyrl"):
         best = others[0]
-        title, hyrl = compared.of(best)[0].title, compared.values("hyrl", "worst")
+        title = compared.of(best)[0].title
+        wins, hyrl = (f"{100 * _middle(compared, n, 'worst'):.2f}%" for n in (best, "hyrl"))
         value, interval = compared.difference(best, "worst")
         between = ""
         if interval is not None:
@@ -101,9 +102,8 @@ def sentences(compared: Compared) -> Iterator[str]:
         if value:
             word += "more" if value > 0 else "less"
         yield (
-            f"The best alternative is {title}, which wins {_cell(compared.values(best, 'worst'), True)} of "
-            f"the starts under attack; HyRL wins {_cell(hyrl, True)}, "
-            f"{word}{between}."
+            f"The best alternative is {title}, which wins from {wins} of the starts under attack; HyRL wins "
+            f"from {hyrl}, {word}{between}."
         )
     for row in compared.rows:
         if row.state == "unfit":
