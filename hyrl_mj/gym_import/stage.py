@@ -342,31 +342,34 @@ def _compare(real: Instance, what: str, ours: np.ndarray | None, theirs: Any) ->
 
 
 def _goes_another_way(real: Instance, how: str) -> BadInput:
-    name = real.name
     if real.own is not None:
-        lasts = outlasting(real)
-        before, draws = real.memory(), dict[str, None]()
-        for _ in range(DRAWS):
-            real.reset()
-            draws |= dict.fromkeys(written.differing(real.memory(), before))
-        drawn = [one for one in draws if one not in {*lasts, *before.generators}]
-        causes = [f"what outlasts resets ({', '.join(lasts[:4])})"] if lasts else []
-        if drawn:
-            causes.append(f"what resets without a seed draw ({', '.join(drawn[:4])})")
-        repair = "let reset() set it back, or pin it by reset, pinned or seed"
-        if lasts and lasts[0].startswith(OF_STATE):
-            repair = "let reset() call mj_resetData"
-        elif lasts and lasts[0].startswith("NormalizeObservation"):
-            repair = (
-                "load its statistics (obs_rms) and set update_running_mean = False where it is made"
-            )
-        return BadInput(
-            f"{name} changes from episode to episode: {how} in a later one. It depends on "
-            f"{' or '.join(causes) or 'what no attribute tells'}, and episodes are played by environments "
-            f"that are like new; {repair}"
+        return _changes(real, how)
+    return BadInput(
+        f"{real.name} goes another way than a new one from the same start with the same inputs: {how} in the "
+        "new one; it depends on other episodes, on time, on chance, on wrappers around a time limit, or on "
+        "what it observes"
+    )
+
+
+def _changes(lived: Instance, how: str) -> BadInput:
+    """Returns the error that a later episode of an instance goes otherwise, with what it may depend on."""
+    lasts = outlasting(lived)
+    before, other = lived.memory(), dict[str, None]()
+    for _ in range(DRAWS):
+        lived.reset()
+        other |= dict.fromkeys(written.differing(lived.memory(), before))
+    draws = [name for name in other if name not in {*lasts, *before.generators}]
+    told = {"what outlasts resets": lasts, "what resets without a seed draw": draws}
+    causes = [f"{what} ({', '.join(names[:4])})" for what, names in told.items() if names]
+    repair = "let reset() set it back, or pin it by reset, pinned or seed"
+    if lasts and lasts[0].startswith(OF_STATE):
+        repair = "let reset() call mj_resetData"
+    elif lasts and lasts[0].startswith("NormalizeObservation"):
+        repair = (
+            "load its statistics (obs_rms) and set update_running_mean = False where it is made"
         )
     return BadInput(
-        f"{name} goes another way than a new one from the same start with the same inputs: {how} in the new "
-        "one; it depends on other episodes, on time, on chance, on wrappers around a time limit, or on what "
-        "it observes"
+        f"{lived.name} changes from episode to episode: {how} in a later one. It depends on "
+        f"{' or '.join(causes) or 'what no attribute tells'}, and here each episode is played by an "
+        f"environment that is like new; {repair}"
     )
