@@ -138,7 +138,8 @@ def _of_robot(instance: Instance, states: np.ndarray, met: np.ndarray) -> list[s
     if not len(own):
         return []
     reach = np.ptp(np.vstack([met, states]), axis=0)
-    turns = [i for i in spec.qpos if i in own and _turns(instance, i - spec.qpos[0])]
+    hinges = instance.model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
+    turns = np.intersect1d(own, spec.qpos[instance.model.jnt_qposadr[hinges]])
     reach[turns] = np.minimum(reach[turns], 2 * np.pi)
     usual = states[0].copy()
     usual[spec.qvel[np.isin(spec.qvel, own)]] = 0.0
@@ -165,12 +166,6 @@ def _of_robot(instance: Instance, states: np.ndarray, met: np.ndarray) -> list[s
         f"{APART:.0%} of what runs reach",
     )
     return []
-
-
-def _turns(instance: Instance, index: int) -> bool:
-    """Returns whether a position, by its index, is the angle of a hinge."""
-    model = instance.model
-    return int(index) in model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE]
 
 
 def _begun(instance: Instance, starts: np.ndarray, seed: int) -> tuple[Fingerprint, np.ndarray]:

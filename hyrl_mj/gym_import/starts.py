@@ -122,6 +122,8 @@ def _check_following(spec: EnvironmentSpec, resets: Resets) -> None:
     drawn = np.ptp(spec.z(resets.states), axis=0).any()
     moved_along, follow = _of_draws(usual, resets) if drawn else _of_one_place(usual)
     starts, none = _starts(spec, rng), np.zeros((spec.max_steps + 1, spec.dimension))
+    # So far away that limits on it show.
+    far = {name: 3 * np.ptp([of(s) for s in starts], axis=0) for name, of in follow.items()}
     for i, state in enumerate(starts):
         moved = moved_along(state)
         names = [usual.physics.names[at] for at in np.flatnonzero(moved != state)]
@@ -135,14 +137,9 @@ def _check_following(spec: EnvironmentSpec, resets: Resets) -> None:
         ours += to_end(run)
         values = {name: of(state) for name, of in follow.items()}
         tries = [(ours, moved, values, [*follow, *names])]
-        if i < EPISODES // 2:
-            for sign in (1, -1) if follow else ():  # so far that limits on it show
-                far = {
-                    n: sign * 3 * np.ptp([of(s) for s in starts], axis=0)
-                    for n, of in follow.items()
-                }
-                away = {name: values[name] + far[name] for name in far}
-                tries.append((ours[:NATURAL], state, away, [*follow]))
+        for sign in (1, -1) if follow and i < EPISODES // 2 else ():
+            away = {name: values[name] + sign * far[name] for name in follow}
+            tries.append((ours[:NATURAL], state, away, [*follow]))
         for seen, start, noted, what in tries:
             other = renewed(other)
             other.noted = partial(_set, other, noted)
@@ -255,18 +252,13 @@ def _setpoints(instance: Instance, state: np.ndarray, now: np.ndarray) -> np.nda
         physics.write(one)
         lengths.append(data.actuator_length.copy())
     moved = now.copy()
-    for i in range(model.nactuator):
-        gain, bias = model.actuator_gainprm[i, 0], model.actuator_biasprm[i, 1]
-        if model.actuator_biastype[i] and bias and gain:
-            by = -bias / gain * (lengths[1] - lengths[0])[model.actuator_outadr[i]]
-            at = model.actuator_actadr[i]
-            has_act = model.actuator_dyntype[i] and at >= 0
-            column = (
-                physics.columns["act"][at]
-                if has_act
-                else physics.columns["ctrl"][model.actuator_ctrladr[i]]
-            )
-            moved[column] += by
+    gain, bias = model.actuator_gainprm[:, 0], model.actuator_biasprm[:, 1]
+    for i in np.flatnonzero((model.actuator_biastype != 0) & (gain != 0) & (bias != 0)):
+        kind, at = "ctrl", model.actuator_ctrladr[i]
+        if model.actuator_dyntype[i] and model.actuator_actadr[i] >= 0:
+            kind, at = "act", model.actuator_actadr[i]
+        away = (lengths[1] - lengths[0])[model.actuator_outadr[i]]
+        moved[physics.columns[kind][at]] -= bias[i] / gain[i] * away
     return moved
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -151,9 +150,8 @@ def check_told(spec: EnvironmentSpec) -> None:
         state, elsewhere = spec.state_at(np.array([z, far if i % 4 else z + step]))
         here = _run(usual, state, inputs, none)
         there = _run(other, elsewhere, inputs[: TOLD - 1], none[:TOLD])
-        differs = _jumps if i % 4 else partial(_far, least=least)
         follow = [
-            {name: b[name] for name in a if name in b and differs(a[name], b[name])}
+            {n: b[n] for n in a if n in b and _differs(a[n], b[n], None if i % 4 else least)}
             for (_, a), (_, b) in zip(here, there, strict=False)
         ]
         if not any(follow):
@@ -270,19 +268,19 @@ def _run(
     return found
 
 
-def _far(here: Any, there: Any, least: float) -> bool:
-    """Returns whether what is told at two places differs by as much as what follows the place does."""
-    a, b = numbers_of(here), numbers_of(there)
-    if a is None or b is None or len(a) != len(b):
-        return False
-    return bool(np.abs(a - b).max(initial=0.0) >= least)
+def _differs(here: Any, there: Any, least: float | None) -> bool:
+    """Returns whether what is told at two places differs as what follows the place does.
 
-
-def _jumps(here: Any, there: Any) -> bool:
-    """Returns whether what is told at two places are other words, truths or whole numbers."""
+    Args:
+        here, there: what is told.
+        least: by how much numbers differ that follow it; None where the places are far apart, and only words,
+            truths and whole numbers tell them apart.
+    """
     if isinstance(here, str):
-        return bool(here != there)
+        return least is None and bool(here != there)
     a, b = numbers_of(here), numbers_of(there)
     if a is None or b is None or len(a) != len(b):
         return False
-    return all(np.array_equal(x, np.rint(x)) for x in (a, b)) and not np.array_equal(a, b)
+    if least is not None:
+        return bool(np.abs(a - b).max(initial=0.0) >= least)
+    return not np.array_equal(a, b) and all(np.array_equal(x, np.rint(x)) for x in (a, b))
