@@ -29,7 +29,7 @@ class At(Puck):
     def reset(self, *, seed=None, options=None):
         gym.Env.reset(self, seed=seed)
         mujoco.mj_resetData(self.model, self.data)
-        place = self.np_random.uniform((-1.8, -1.2), (-1.0, 1.2)) if self.draws else PLACE
+        place = self.np_random.uniform((-1.8, -1.2), (-1.0, 1.2)) if self.draws else PLACE.copy()
         self.begin(place)
         self.data.qpos[:2] = place
         mujoco.mj_forward(self.model, self.data)
@@ -272,11 +272,11 @@ class Towing(Tied):
 @pytest.mark.parametrize(
     ("make", "given", "message"),
     [
-        (Ahead, {}, r"stays elsewhere \(goal"),
+        (Ahead, {}, r"notes where it leads to \(goal"),
         (HomeInAClosure, {}, r"notes where it leads to \(away.place\)"),
         (HomeOfWholeNumbers, {}, r"notes where it leads to \(line\)"),
         (HomeOfAKey, {}, r"notes where it leads to \(line\)"),
-        (Furthest, {}, r"stays elsewhere \(best"),
+        (Furthest, {}, r"notes where it leads to \(best"),
         (Written, {}, r"notes where it leads to \(best\)"),
         (Walked, {}, r"notes where it leads to \(x, y\)"),
         (Walking, {}, r"notes where it leads to \(place\)"),
@@ -288,7 +288,7 @@ class Towing(Tied):
         (Fence, {"seed": 0, "starts": "reset"}, r"notes where it leads to \(home\)"),
         (FenceAtOnePlace, {}, r"notes where it leads to \(home\)"),
         (FenceByDistance, {"seed": 0}, r"notes where it leads to \(most\)"),
-        (FenceByRegion, {}, "draws region|goes otherwise after"),
+        (FenceByRegion, {}, r"draws region|notes where it leads to \(region"),
         (FenceByMarker, {"seed": 0}, r"notes where it leads to \(site_pos of its model\)"),
         (Tied, {"chart": {"x": "x", "y": "y"}}, "or limits of tendons tie the robot of Tied"),
         (
@@ -465,6 +465,22 @@ class Servo(At):
         self.data.ctrl[:] = place
 
 
+class ServoToAGoal(Servo):
+    """Each reset draws its place, to which it sets the setpoints, and its goal."""
+
+    xml = Servo.xml.replace(
+        "<worldbody>", '<worldbody><body name="goal" mocap="true" pos="1.5 0 0"/>'
+    )
+    draws = True
+
+    def begin(self, place):
+        super().begin(place)
+        self.data.mocap_pos[0, 1] = self.aim = self.np_random.uniform(-0.5, 0.5)
+
+    def _get_obs(self):
+        return super()._get_obs() | {"to_goal": self.data.mocap_pos[0, :2] - self.data.qpos[:2]}
+
+
 PINNED = {"pinned": {"goal": np.array([1.0, 2.0])}}
 
 
@@ -478,6 +494,7 @@ def shared_rewards():
         (Shaped, {}),
         (Shaped, {"seed": 0}),
         (Servo, {}),
+        (ServoToAGoal, {"seed": 3}),
         (shared_rewards, {}),
         (Posture, {}),
         (Ahead, PINNED),

@@ -217,6 +217,8 @@ def test_a_curriculum_that_ends_before_it_is_looked_at_is_refused(where):
 class Sticky(Puck):
     """Remembers in a place that is not reset whether it has been near the rock."""
 
+    most = 5
+
     def __init__(self):
         super().__init__()
         self.memory = {"model": self.model.opt, "data": mujoco.MjData(self.model)}
@@ -228,12 +230,15 @@ class Sticky(Puck):
     def step(self, action):
         observation, reward, terminated, truncated, info = super().step(action)
         self.remember()
-        info["success"] = info["success"] and self.memory["data"].time < 5
+        info["success"] = info["success"] and self.memory["data"].time < self.most
         return observation, reward, terminated, truncated, info
 
 
-def test_a_second_state_of_mujoco_that_outlasts_resets_makes_no_difference():
-    task = from_gymnasium(Sticky, steps=60)
+def test_a_second_state_of_mujoco_is_remembered_and_may_not_outlast_resets():
+    with pytest.raises(BadInput, match=r"outlasts resets \(memory\['data'\]\), "):
+        from_gymnasium(Sticky, steps=60)
+    harmless = type("Harmless", (Sticky,), {"most": np.inf})
+    task = from_gymnasium(harmless, steps=60)
     assert ends(task) == ends(task)
     assert not task.abilities.restarts
 
@@ -648,7 +653,7 @@ class Promoted(Puck):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (Lagging, r"Lagging changes .* outlasts resets \(time, act, .* mj_resetData"),
+        (Lagging, r"Lagging changes .* outlasts resets \(MuJoCo's time, .*'s act.* mj_resetData"),
         (lambda: FlattenObservation(InTurn()), r"changes from .* outlasts resets \(.*turn\)"),
         (Promoted, r"outlasts resets \(level\), "),
         (lambda: normalised(False), r"outlasts .*obs_rms.*set update_running_mean = False"),
@@ -705,7 +710,9 @@ class Picky(Puck):
 @pytest.mark.parametrize(("make", "what"), [(Seeded, "share"), (Champion, "wins"), (Picky, "side")])
 def test_an_environment_that_is_never_replaced_is_a_judge_too(make, what):
     starts = np.random.default_rng(0).uniform((-1.8, 0.7), (1, 1.2), (30, 2))
-    with pytest.raises(BadInput, match=rf"later episode, after a reset without .*{what}.* matters"):
+    with pytest.raises(
+        BadInput, match=rf"in a later one. It depends on .*resets .*{what}.*; let reset"
+    ):
         outcomes(lambda: FlattenObservation(make()), steps=140, starts=starts)
 
 

@@ -14,7 +14,7 @@ from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.gym_import.instance import Instance
 from hyrl_mj.gym_import.observations import columns_of
 from hyrl_mj.gym_import.opening import AnyChart
-from hyrl_mj.gym_import.specification import Axis, Coordinate, EnvironmentSpec
+from hyrl_mj.gym_import.specification import Axis, Coordinate
 from hyrl_mj.physics import mjcf
 from hyrl_mj.tasks import touching
 
@@ -168,8 +168,9 @@ def robot_of(model: mujoco.MjModel, chart: Sequence[Coordinate]) -> np.ndarray:
     return np.isin(model.body_treeid, list(trees))
 
 
-def own_of(spec: EnvironmentSpec, model: mujoco.MjModel) -> np.ndarray:
+def own_of(instance: Instance) -> np.ndarray:
     """Returns the places of the robot's positions and velocities in a state of MuJoCo."""
+    spec, model = instance.spec, instance.model
     robot = robot_of(model, spec.coordinates)
     body_of_qpos = np.repeat(model.jnt_bodyid, np.diff(np.append(model.jnt_qposadr, model.nq)))
     return np.append(spec.qpos[robot[body_of_qpos]], spec.qvel[robot[model.dof_bodyid]])
@@ -339,6 +340,7 @@ def _turns_alike(instance: Instance, c: Coordinate, begun: np.ndarray) -> bool:
         inputs, seen = [instance.drawn(rng)] * 4, []
         for turn in turns:
             start = spec.state_at((z + turn * (np.arange(len(z)) == i))[None])[0]
+            instance.renew()
             runs = instance.play(start, inputs, np.zeros((len(inputs) + 1, len(z))))
             seen.append(np.concatenate([np.append(one.observation, one.report) for one in runs]))
         usual, *turned = seen

@@ -51,7 +51,7 @@ def check_draws(instance: Instance, resets: Resets, met: np.ndarray) -> str:
             n: 0.1 for n in left if n.startswith(("qpos[", "qvel[", "mocap_pos[", "userdata["))
         }:
             how = f"with values as {json.dumps({'pinned': dict(list(positions.items())[:4])})}"
-        of_place = all(follows(instance.spec, instance.model, resets, n) for n in left)
+        of_place = all(follows(instance, resets, n) for n in left)
         noted = ", or sets it to the place that it leads to" if of_place else ""
         step = ", or let the first step() note the place" if of_place else ""
         raise BadInput(
@@ -78,10 +78,15 @@ def _drawn(instance: Instance, resets: Resets) -> list[str]:
     states = resets.states
     varies = np.ptp(states, axis=0) > 0
     varies[instance.physics.columns["warmstart"]] = False  # it says nothing of where a run goes
-    varies[own_of(instance.spec, instance.model)] = False
-    names = [name for name, v in zip(_names_of_state(instance), varies, strict=True) if v]
+    varies[own_of(instance)] = False
+    names = [name for name, v in zip(instance.physics.names, varies, strict=True) if v]
     again = [_begun(instance, states[:1], 0)[0] for _ in range(2)]
     lasting = set(differing(*again))  # what outlasts a reset is not drawn by it
+    if own := lasting & {*again[0].generators}:
+        raise BadInput(
+            f"{instance.name} draws random numbers in reset(), from a generator that its seed does not "
+            f"decide ({min(own)}): let it draw from self.np_random"
+        )
     begun = [
         _begun(
             Instance(instance.spec) if lasting else instance,
@@ -128,12 +133,13 @@ def _of_robot(instance: Instance, states: np.ndarray, met: np.ndarray) -> list[s
     chart as runs begin.
     """
     spec, physics = instance.spec, instance.physics
-    own = own_of(spec, instance.model)
+    own = own_of(instance)
     own = own[(np.ptp(states[:, own], axis=0) > 0) & ~np.isin(own, spec.places)]
     if not len(own):
         return []
     reach = np.ptp(np.vstack([met, states]), axis=0)
-    turns = [i for i in spec.qpos if i in own and _turns(instance, i - spec.qpos[0])]
+    hinges = instance.model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
+    turns = np.intersect1d(own, spec.qpos[instance.model.jnt_qposadr[hinges]])
     reach[turns] = np.minimum(reach[turns], 2 * np.pi)
     usual = states[0].copy()
     usual[spec.qvel[np.isin(spec.qvel, own)]] = 0.0
@@ -150,7 +156,7 @@ def _of_robot(instance: Instance, states: np.ndarray, met: np.ndarray) -> list[s
             ends.append((len(results), physics.read()[spec.places]))
         (k, here), (n, there) = ends
         depends = k != n or bool((np.abs(here - there) > APART * reach[spec.places]).any())
-    names = [_names_of_state(instance)[i] for i in own]
+    names = [physics.names[i] for i in own]
     if depends:
         return names
     _keep(
@@ -160,12 +166,6 @@ def _of_robot(instance: Instance, states: np.ndarray, met: np.ndarray) -> list[s
         f"{APART:.0%} of what runs reach",
     )
     return []
-
-
-def _turns(instance: Instance, index: int) -> bool:
-    """Returns whether a position, by its index, is the angle of a hinge."""
-    model = instance.model
-    return int(index) in model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE]
 
 
 def _begun(instance: Instance, starts: np.ndarray, seed: int) -> tuple[Fingerprint, np.ndarray]:
@@ -184,11 +184,6 @@ def _begun(instance: Instance, starts: np.ndarray, seed: int) -> tuple[Fingerpri
     return remembered, np.concatenate(told)
 
 
-def _names_of_state(instance: Instance) -> list[str]:
-    """Returns the names of the entries of a state of MuJoCo, as "qpos[0]"."""
-    return [f"{kind}[{i}]" for kind, at in instance.physics.columns.items() for i in range(len(at))]
-
-
 def _changed_by_user(instance: Instance) -> set[str]:
     """Returns the names of what the user's options of reset and pinned values change after a reset."""
     found = set(instance.spec.description.pinned)
@@ -198,7 +193,7 @@ def _changed_by_user(instance: Instance) -> set[str]:
             instance.reset(seed, plain)
             seen.append(remembered := instance.memory())
             state = instance.physics.read().tolist()
-            remembered.update(zip(_names_of_state(instance), state, strict=True))
+            remembered.update(zip(instance.physics.names, state, strict=True))
         found.update(differing(*seen))
     return found
 

@@ -24,7 +24,7 @@ from hyrl_mj.gym_import.coordinates import (
 from hyrl_mj.gym_import.draws import check_draws
 from hyrl_mj.gym_import.expressions import Expression
 from hyrl_mj.gym_import.fingerprint import codes_of, differing, is_known
-from hyrl_mj.gym_import.instance import Instance
+from hyrl_mj.gym_import.instance import Instance, outlasting
 from hyrl_mj.gym_import.observations import parts_of
 from hyrl_mj.gym_import.opening import (
     COUNTING,
@@ -39,13 +39,7 @@ from hyrl_mj.gym_import.pool import Pool
 from hyrl_mj.gym_import.resets import resets_of
 from hyrl_mj.gym_import.specification import Criterion
 from hyrl_mj.gym_import.starts import check_noted
-from hyrl_mj.gym_import.uses import (
-    changes_by_reset,
-    check_episodes,
-    check_told,
-    check_use,
-    senses,
-)
+from hyrl_mj.gym_import.uses import check_told, check_use, senses
 from hyrl_mj.physics import mjcf
 from hyrl_mj.sets import Chart
 
@@ -88,26 +82,31 @@ def inspect(description: Description, untried: bool = False) -> tuple[Pool, Inst
     resets = resets_of(instance)
     if draws := check_draws(instance, resets, states):
         instance.spec.found["goal"] = draws
-    instance = Instance(instance.spec)  # something may have outlasted the resets of the other
+    used, instance = instance, Instance(instance.spec)  # something may have outlasted resets
     instance.learn(state=_at_rest(instance, resets.states))
     _learn_bounds(instance, instance.spec.z(states), instance.spec.z(resets.states))
-    check_episodes(instance.spec)
-    instance.learn(recalled=trials.check_observer(instance))
+    instance.learn(recalled=trials.check_observer(instance.spec))
+    pool.learn(instance.spec)
+    trials.check_episodes(pool)
     check_use(instance.spec)
     derived, late = trials.derived_of(instance)
     if late:
         instance.spec.found["lag"] = f"observation {', '.join(map(str, late))} {LAG[derived]}"
     instance.learn(derived=derived)
     if instance.is_wrapped:
-        instance.learn(anew=changes_by_reset(instance.spec))
         check_told(instance.spec)
         instance.learn(sensing=senses(instance.spec))
     check_noted(instance.spec, resets)
-    pool.spec = instance.spec
+    pool.learn(instance.spec)
     moves, at_rest = trials.moving(pool)
-    trials.check_instances(pool)
+    trials.check_noise(pool)
     memoryless = pool.spec.memoryless and trials.goes_on(pool)
-    pool.spec = replace(pool.spec, moves=moves, at_rest=at_rest, memoryless=memoryless)
+    pool.learn(replace(pool.spec, moves=moves, at_rest=at_rest, memoryless=memoryless))
+    if lasts := outlasting(used):
+        instance.spec.found["episodes"] = (
+            "each is played by a new environment, because of what outlasts resets "
+            f"({', '.join(lasts[:4])}); no trial shows that what comes next depends on it"
+        )
     instance = Instance(pool.spec)
     instance.reset()
     return pool, instance
@@ -352,9 +351,7 @@ def _learn_bounds(instance: Instance, met: np.ndarray, begun: np.ndarray) -> Non
     begun = begun + (chart.wrap(middle) - middle)
     ends = [begun.min(axis=0), begun.max(axis=0)]
     lead = ", ".join(f"{n} {a:.3g} to {b:.3g}" for n, a, b in zip(names, *ends, strict=True))
-    moving = np.flatnonzero(
-        np.isin(spec.qvel, own_of(spec, instance.model)) & (spec.state[spec.qvel] != 0)
-    )
+    moving = np.flatnonzero(np.isin(spec.qvel, own_of(instance)) & (spec.state[spec.qvel] != 0))
     but = f" but for {', '.join(f'qvel[{i}]' for i in moving)}" if len(moving) else ""
     found["starts"] = (
         f"all over the chart, the robot at rest{but} and all else as after a reset (deeper than "

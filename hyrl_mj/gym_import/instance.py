@@ -46,8 +46,8 @@ class Seen(NamedTuple):
     report: Sequence[float]
 
 
-# States, or chart points, with observations.
-Samples = Iterable[tuple[np.ndarray, np.ndarray]]
+# What is put before names of parts of MuJoCo's state, among those of what is remembered.
+OF_STATE = "MuJoCo's "
 
 
 class Instance:
@@ -182,12 +182,8 @@ class Instance:
             self.pin()
         return observation
 
-    def put(
-        self, state: np.ndarray, seed: int | None = None, noise: np.ndarray | None = None
-    ) -> np.ndarray:
+    def put(self, state: np.ndarray, seed: int | None = None) -> np.ndarray:
         """Resets the environment and puts it to a state of MuJoCo (S,); returns what it observes there (o,).
-
-        It observes under noise (d,), by default none.
 
         Wrappers see the start as the first observation, as if the reset of the innermost environment had led
         there.
@@ -195,7 +191,7 @@ class Instance:
         if not self.is_wrapped:
             self.reset(seed)
         self.begin(state, seed)
-        self.sense(noise)
+        self.sense()
         return self.observation
 
     def play(
@@ -205,15 +201,17 @@ class Instance:
         noises: np.ndarray,
         seed: int | None = None,
     ) -> Iterator[Seen]:
-        """Yields what is seen of a run at its start, and after each sample.
+        """Yields what is seen of a run at its start, after a reset (see `renew`), and after each sample.
 
         Args:
             start: MuJoCo's state (S,).
             inputs: (k, m) of the samples.
             noises: (k + 1, d) on the coordinates of the chart.
-            seed: of the reset, by default the one that all runs begin from.
+            seed: of the reset of wrappers, by default the one that all runs begin from.
         """
-        yield Seen(start, self.put(start, seed, noises[0]), ())
+        self.begin(start, seed)
+        self.sense(noises[0])
+        yield Seen(start, self.observation, ())
         yield from self.goes_on(inputs, noises[1:])
 
     def goes_on(self, inputs: Iterable[np.ndarray], noises: np.ndarray) -> Iterator[Seen]:
@@ -229,6 +227,8 @@ class Instance:
         if self.own is not None:
             given, state = state, self.physics.read()
             state[self.own] = given[self.own]
+        if self.noted is not None:
+            self.noted()
         self.physics.write(state)
         self.inner_seen, self._at_start, self._samples = self.watched(), True, 0
 
@@ -237,17 +237,16 @@ class Instance:
         if pinned := self.spec.description.pinned:
             set_pins(self.inner, self.data, pinned, self.name)
             self.physics.write(self.physics.read())
-        if self.noted is not None:
-            self.noted()
 
     def memory(self) -> written.Fingerprint:
         """Returns what it remembers now outside of its state in MuJoCo: attributes, and MuJoCo's model."""
         return written.fingerprint(self.env, self.model, self.data)
 
     def remembered(self) -> written.Fingerprint:
-        """Returns what it remembers now, to compare it: `memory`, and MuJoCo's state."""
-        found = self.memory()
-        found["MuJoCo's state"] = self.physics.read().tobytes()
+        """Returns what it remembers now, to compare it: `memory`, and the parts of MuJoCo's state."""
+        found, state = self.memory(), self.physics.read()
+        for part, at in self.physics.columns.items():
+            found[f"{OF_STATE}{part}"] = state[at].tobytes()
         return found
 
     def jump(self, state: np.ndarray) -> None:
@@ -268,9 +267,6 @@ class Instance:
             What of it is not like a new one, so that it can play no other; "" if all is.
         """
         self.quit()
-        if self.spec.anew:
-            self._begun = written.shared(self.env)
-            return ""
         self.reset()
         return self.mark()
 
@@ -621,14 +617,31 @@ class Instance:
         )
 
 
-def check_unveiled(name: str, ours: Samples, veiled: Samples) -> None:
-    """Raises `BadInput` if a run of an environment observes otherwise where the true state is veiled."""
-    for (state, seen), (other_state, other) in zip(ours, veiled, strict=False):
-        if not np.array_equal(state, other_state, equal_nan=True):
-            return  # a wrapper controls the robot by what it reads, or has written there
-        if not np.array_equal(seen, other, equal_nan=True):
-            raise BadInput(
-                f"a wrapper of {name} observes what it has read from MuJoCo's state before it stepped the "
-                "environment, or reads seldom, and noise does not reach that: let it read after each step, "
-                "and keep that"
-            )
+def renewed(instance: Instance) -> Instance:
+    """Returns what can play another run: an instance, or a new one if something outlasts its resets."""
+    instance.noted = instance.follow = None
+    if instance.renew():
+        instance = Instance(instance.spec)
+        instance.renew()  # what it is like when it is new
+    return instance
+
+
+def to_end(run: Iterable[Seen]) -> Iterator[Seen]:
+    """Yields what is seen of a run to the first end of its episode."""
+    for seen in run:
+        yield seen
+        if any(seen.report[1:3]):
+            return
+
+
+def outlasting(old: Instance) -> list[str]:
+    """Returns the names of what the reset with the seed leaves otherwise in an instance than in a new one."""
+    seed, remembered = old.spec.description.seed or 0, []
+    for one in (Instance(old.spec), Instance(old.spec), old):
+        one.quit()
+        one.reset(seed)
+        remembered.append(one.remembered())
+    new, twin, now = remembered
+    # Names of files differ between any two, say, and the warm start tells nothing of where a run goes.
+    passed = {*written.differing(new, twin), f"{OF_STATE}warmstart"}
+    return [name for name in written.differing(now, new) if name not in passed]

@@ -37,6 +37,11 @@ class Physics:
                 found[name], at = np.arange(at, at + size), at + size
         return found
 
+    @cached_property
+    def names(self) -> list[str]:
+        """The names of the entries of a state, as "qpos[0]"."""
+        return [f"{part}[{i}]" for part, at in self.columns.items() for i in range(len(at))]
+
     def read(self) -> np.ndarray:
         """Returns MuJoCo's state (S,), a new array."""
         state = np.empty(self.size)

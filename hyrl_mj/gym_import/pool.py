@@ -98,12 +98,17 @@ class Pool:
         if isinstance(found, Exception):
             raise found
 
+    def learn(self, spec: EnvironmentSpec) -> None:
+        """Takes what is known by now; instances that play by what was known before are given up."""
+        self.spec, self._stage, self._hands = spec, None, []
+        self.left.clear()
+
     def scatter(self, what: str, *values: np.ndarray) -> Arrays:
         """Has all processes do something with values (k, ...): "rest" or "branch"; see `Stage`."""
         return self.ask(what, self.places(len(values[0])), *values)
 
-    def check(self, runs: Sequence[Played], alone: bool = False) -> None:
-        """Has runs played by the real environment, in new processes: one on each core, or one for each run.
+    def check(self, runs: Sequence[Played], processes: int | None = None) -> None:
+        """Has runs played by the real environment, in so many new processes, by default one on each core.
 
         Raises:
             BadInput: a run goes another way there.
@@ -112,7 +117,7 @@ class Pool:
             with self._lock:
                 self._answers("check", {0: [runs]})
             return
-        count = len(runs) if alone else min(cores.count(), len(runs))
+        count = min(processes or cores.count(), len(runs))
         hands = [self._process() for _ in range(count)]
         for i, hand in enumerate(hands):
             hand.send(("check", [runs[i::count]]))

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import mujoco
 import numpy as np
 
+from hyrl_mj.gym_import.attributes import numbers_in
 from hyrl_mj.gym_import.coordinates import own_of
 from hyrl_mj.gym_import.fingerprint import differing
 from hyrl_mj.gym_import.instance import Instance
-from hyrl_mj.gym_import.specification import EnvironmentSpec
-from hyrl_mj.gym_import.uses import held, numbers_of
 
 # Resets that are looked at, and values of what they leave behind that are told apart.
 RESETS, VALUES = 64, 8
@@ -60,8 +59,8 @@ class Resets:
 def resets_of(instance: Instance) -> Resets:
     """Returns what resets lead to."""
     states, differ, violation = [], dict[str, list[int]](), 0.0
-    values, numbers = dict[str, list[Any]](), dict[str, dict[int, np.ndarray]]()
-    first = None
+    values, of_model = dict[str, list[Any]](), dict[str, np.ndarray]()
+    rows, first = list[dict[str, np.ndarray]](), None
     for seed in range(RESETS):
         instance.reset(seed)
         states.append(instance.physics.read())
@@ -76,18 +75,24 @@ def resets_of(instance: Instance) -> Resets:
             if name.endswith(OF_MODEL) and name != f"opt{OF_MODEL}":
                 part = getattr(instance.model, name.removesuffix(OF_MODEL))
                 usual = np.frombuffer(first[name], part.dtype).astype(float)
-                of_part = numbers.setdefault(name, dict.fromkeys(range(RESETS), usual))
-                of_part[seed] = part.ravel().astype(float)
-        for name, owner, key in held(instance.inner, {}):
-            if (found := numbers_of(owner[key])) is not None:
-                numbers.setdefault(name.removeprefix("attribute "), {})[seed] = found
-    tables = {
-        name: np.array([*rows.values()])
-        for name, rows in numbers.items()
-        if len(rows) == RESETS and len({len(row) for row in rows.values()}) == 1
-    }
+                of_part = of_model.setdefault(name, np.tile(usual, (RESETS, 1)))
+                of_part[seed] = part.ravel()
+        rows.append(numbers_in(instance.inner))
+    tables = {**of_model, **tabled(rows)}
     tables = {name: table for name, table in tables.items() if (table != table[0]).any()}
     return Resets(np.array(states), differ, tables, violation)
+
+
+def tabled(rows: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Returns a table (n, k) of each name by which n rows have k numbers."""
+    names = [
+        n for n, numbers in rows[0].items() if all(_is_as(row.get(n), numbers) for row in rows)
+    ]
+    return {name: np.array([row[name] for row in rows]) for name in names}
+
+
+def _is_as(numbers: np.ndarray | None, others: np.ndarray) -> bool:
+    return numbers is not None and len(numbers) == len(others)
 
 
 def violation_of(instance: Instance) -> float:
@@ -101,22 +106,27 @@ def violation_of(instance: Instance) -> float:
 # ---- what follows the place
 
 
-def terms_of(spec: EnvironmentSpec, model: mujoco.MjModel, states: np.ndarray) -> np.ndarray:
+# What gives numbers (k,) at a state (S,).
+Predict = Callable[[np.ndarray], np.ndarray]
+
+
+def terms_of(instance: Instance, states: np.ndarray) -> np.ndarray:
     """Returns the terms (n, t), of states (n, S), that what follows from the robot's place is a sum of."""
-    own = [i for i in own_of(spec, model) if i in spec.qpos and i not in spec.places]
+    spec = instance.spec
+    own = [i for i in own_of(instance) if i in spec.qpos and i not in spec.places]
     others = [states[:, own]] if len(own) < RESETS // 2 else []
     return np.column_stack([spec.terms(spec.z(states)), *others])
 
 
-Predict = Callable[[np.ndarray], np.ndarray]
+def predicted(instance: Instance, states: np.ndarray, table: np.ndarray) -> Predict | None:
+    """Returns what gives numbers, as tables (n, k) of states (n, S) hold them; None if none follows it.
 
-
-def predicted(terms: np.ndarray, table: np.ndarray) -> Predict | None:
-    """Returns what gives the columns of a table (n, k) from terms (t,), where these tell some that vary.
-
-    A column, or its square as of a distance, may be a sum of the terms; the others stay as in the first row.
+    A number, or its square as of a distance, may be a sum of the terms. One that does not follow the place
+    is NaN.
     """
-    varies = np.ptp(table, axis=0) > 1e-9
+    if not np.isfinite(table).all():
+        return None
+    terms, varies = terms_of(instance, states), np.ptp(table, axis=0) > 1e-9
     plain, square = (np.linalg.lstsq(terms, t, rcond=None)[0] for t in (table, table**2))
 
     def exact(fit: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -128,17 +138,27 @@ def predicted(terms: np.ndarray, table: np.ndarray) -> Predict | None:
     if not (is_plain | is_square).any():
         return None
 
-    def predict(of: np.ndarray) -> np.ndarray:
+    def predict(state: np.ndarray) -> np.ndarray:
+        of = terms_of(instance, state[None])[0]
         root = np.sqrt(np.maximum(of @ square, 0))
-        return np.where(is_plain, of @ plain, np.where(is_square, root, table[0]))
+        return np.where(is_plain, of @ plain, np.where(is_square, root, np.nan))
 
     return predict
 
 
-def follows(spec: EnvironmentSpec, model: mujoco.MjModel, resets: Resets, name: str) -> bool:
+def following(
+    instance: Instance, states: np.ndarray, tables: Mapping[str, np.ndarray]
+) -> dict[str, Predict]:
+    """Returns what gives numbers, by the names of their tables (n, k) of states (n, S), if they follow it."""
+    found = {name: predicted(instance, states, table) for name, table in tables.items()}
+    return {name: predict for name, predict in found.items() if predict is not None}
+
+
+def follows(instance: Instance, resets: Resets, name: str) -> bool:
     """Returns whether an attribute or a part of the model follows the place that resets lead to."""
     if (table := resets.numbers.get(name)) is None:
         return False
-    terms = terms_of(spec, model, resets.states)
-    predict = predicted(terms, table)
-    return predict is not None and np.allclose([predict(of) for of in terms], table, SAME, SAME)
+    if (predict := predicted(instance, resets.states, table)) is None:
+        return False
+    told = np.array([predict(state) for state in resets.states])
+    return np.allclose(np.where(np.isnan(told), table[0], told), table, SAME, SAME)

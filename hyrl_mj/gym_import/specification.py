@@ -191,7 +191,6 @@ class EnvironmentSpec:
         derived: `Derived`.
         sensing: how `derived` is shown to wrappers that read MuJoCo's state for what they observe, and see it
             under noise; "" if none does.
-        anew: whether a reset changes what the next one does to a wrapper: each episode takes a new instance.
         moves: (o,) bool, the columns of an observation at rest that follow the chart.
         at_rest: a matrix (t, o) that gives what is observed at rest at z from `terms` of z, if one does.
         found: what was filled in, with the reason, by name.
@@ -229,7 +228,6 @@ class EnvironmentSpec:
     recalled: np.ndarray = field(default_factory=_none)
     derived: Derived = "unknown"
     sensing: Derived | Literal[""] = ""
-    anew: bool = False
     moves: np.ndarray = field(default_factory=_none)
     at_rest: np.ndarray | None = None
     found: dict[str, str] = field(default_factory=dict)

@@ -16,7 +16,7 @@ from hyrl_mj.errors import BadInput
 from hyrl_mj.files import trust
 from hyrl_mj.gym_import import fingerprint as written
 from hyrl_mj.gym_import.coordinates import own_of
-from hyrl_mj.gym_import.instance import Instance, check_unveiled
+from hyrl_mj.gym_import.instance import OF_STATE, Instance, outlasting
 from hyrl_mj.gym_import.specification import EnvironmentSpec
 from hyrl_mj.system import limits
 from hyrl_mj.tasks import Outcome
@@ -27,6 +27,8 @@ VEILED = 8
 # Runs of a judgement that an environment plays, too, which goes on from episode to episode; all of them where
 # something outlasts its resets.
 LIVED = 16
+# Resets that show what they draw without a seed.
+DRAWS = 8
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ class Stage:
         # Which play nothing but what they judge, as their user has them, or without time limits.
         self._judges: dict[bool, list[Instance]] = {True: [], False: []}
         self._lived: dict[bool, Instance] = {}  # which is never replaced
-        self._wears = spec.anew  # whether something has outlasted a reset
+        self._wears = False  # whether something has outlasted a reset
         self._veiled: list[Instance] = []
         self._resting: Instance | None = None
         self._fresh: Instance | None = None  # which has only been reset
@@ -188,11 +190,17 @@ class Stage:
         real = self._renewed(self._veiled)
         real.learn(sensing=real.spec.sensing or "now")
         real.veiled, real.tamper = True, tuple  # they may write there
-        veiled = (
-            (run.path[0] if k == 0 else real.spec.z(seen.state[None])[0], seen.observation)
-            for k, seen in enumerate(real.play(run.start, run.inputs, run.noise))
-        )
-        check_unveiled(real.name, zip(run.path, run.observations, strict=False), veiled)
+        veiled = real.play(run.start, run.inputs, run.noise)
+        for z, seen, other in zip(run.path, run.observations, veiled, strict=False):
+            there = real.spec.z(other.state[None])[0]
+            if other.report and not np.array_equal(z, there, equal_nan=True):
+                break  # a wrapper controls the robot by what it reads, or has written there
+            if not np.array_equal(seen, other.observation, equal_nan=True):
+                raise BadInput(
+                    f"a wrapper of {real.name} observes what it has read from MuJoCo's state before it "
+                    "stepped the environment, or reads seldom, and noise does not reach that: let it read "
+                    "after each step, and keep that"
+                )
         self._veiled.append(real)
 
     def _live(self, run: Played, as_it_is: bool) -> None:
@@ -200,8 +208,11 @@ class Stage:
         if (lived := self._lived.get(as_it_is)) is None:
             lived = self._lived[as_it_is] = Instance(self.spec, as_it_is)
             warmstart = lived.physics.columns["warmstart"]
-            lived.own = np.append(own_of(self.spec, lived.model), warmstart)
-        judge(replace(run, rewards=None), lived, run.noise, None)
+            lived.own = np.append(own_of(lived), warmstart)
+        lived.renew()
+        # A reward that no episode is judged by may be normalised by those before.
+        rewards = run.rewards if "reward" in self.spec.criterion.asked else None
+        judge(replace(run, rewards=rewards), lived, run.noise, None)
 
     def _acted(
         self, instances: Sequence[Instance], u: np.ndarray, begun: np.ndarray | None = None
@@ -222,8 +233,6 @@ class Stage:
 
     def _renewed(self, spare: list[Instance], real: bool = False) -> Instance:
         """Returns an instance that can begin an episode: a spare one, or a new one if these are worn."""
-        if self.spec.anew:  # each plays one
-            spare.clear()
         while True:
             instance = spare.pop() if spare else self._new(real)
             if not (worn := instance.renew()):
@@ -317,9 +326,6 @@ def judge(run: Played, real: Instance, noise: np.ndarray, fresh: Instance | None
         ours, theirs = (Outcome(int(values[k])).label for values in (expected, ends))
         how = "" if heard else " without the noise, which must not judge"
         raise _goes_another_way(real, f"after {k + 1} sample(s) it is {ours}, and {theirs}{how}")
-        raise _goes_another_way(
-            real.name, f"after {k + 1} sample(s) it is {ours}, and {theirs}{how}"
-        )
     return True
 
 
@@ -336,21 +342,34 @@ def _compare(real: Instance, what: str, ours: np.ndarray | None, theirs: Any) ->
 
 
 def _goes_another_way(real: Instance, how: str) -> BadInput:
-    name = real.name
     if real.own is not None:
-        new = Instance(real.spec)
-        for one in (new, real):
-            one.quit()
-            one.reset()
-        differ = written.differing(real.memory(), new.memory())
-        names = [n for n in differ if n not in real.memory().generators]
-        return BadInput(
-            f"{name} goes another way in a later episode, after a reset without a seed, than in the first: "
-            f"{how} there. What resets draw, or what outlasts them ({', '.join(names[:4]) or 'unknown'}), "
-            "matters: let reset() set it back, or pin it by reset, pinned or seed"
+        return _changes(real, how)
+    return BadInput(
+        f"{real.name} goes another way than a new one from the same start with the same inputs: {how} in the "
+        "new one; it depends on other episodes, on time, on chance, on wrappers around a time limit, or on "
+        "what it observes"
+    )
+
+
+def _changes(lived: Instance, how: str) -> BadInput:
+    """Returns the error that a later episode of an instance goes otherwise, with what it may depend on."""
+    lasts = outlasting(lived)
+    before, other = lived.memory(), dict[str, None]()
+    for _ in range(DRAWS):
+        lived.reset()
+        other |= dict.fromkeys(written.differing(lived.memory(), before))
+    draws = [name for name in other if name not in {*lasts, *before.generators}]
+    told = {"what outlasts resets": lasts, "what resets without a seed draw": draws}
+    causes = [f"{what} ({', '.join(names[:4])})" for what, names in told.items() if names]
+    repair = "let reset() set it back, or pin it by reset, pinned or seed"
+    if lasts and lasts[0].startswith(OF_STATE):
+        repair = "let reset() call mj_resetData"
+    elif lasts and lasts[0].startswith("NormalizeObservation"):
+        repair = (
+            "load its statistics (obs_rms) and set update_running_mean = False where it is made"
         )
     return BadInput(
-        f"{name} goes another way than a new one from the same start with the same inputs: {how} in the new "
-        "one; it depends on other episodes, on time, on chance, on wrappers around a time limit, or on what "
-        "it observes"
+        f"{lived.name} changes from episode to episode: {how} in a later one. It depends on "
+        f"{' or '.join(causes) or 'what no attribute tells'}, and here each episode is played by an "
+        f"environment that is like new; {repair}"
     )

@@ -8,31 +8,31 @@ load that is tied to the robot.
 from __future__ import annotations
 
 import copy
-from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from itertools import chain
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from hyrl_mj.errors import BadInput
+from hyrl_mj.gym_import.attributes import held, like, numbers_in, numbers_of, set_numbers
 from hyrl_mj.gym_import.coordinates import own_of
 from hyrl_mj.gym_import.fingerprint import differing, shared_variables
-from hyrl_mj.gym_import.instance import Instance, Seen
+from hyrl_mj.gym_import.instance import Instance, Seen, renewed, to_end
 from hyrl_mj.gym_import.resets import (
     OF_MODEL,
     SAME,
     Predict,
     Resets,
+    following,
     predicted,
+    tabled,
     terms_of,
     violation_of,
 )
 from hyrl_mj.gym_import.specification import EnvironmentSpec
 from hyrl_mj.gym_import.trials import EPISODES, HELD, SAMPLES
-from hyrl_mj.gym_import.uses import held, numbers_of
 
 # Samples of a run from the start of a reset, which is compared with one that is put there.
 NATURAL = 100
@@ -42,77 +42,12 @@ LINES = 100_000
 VIOLATED = 1e-3
 
 
-# ---- what would be set to another place
-
-
-def _setpoints(instance: Instance, state: np.ndarray, now: np.ndarray) -> np.ndarray:
-    """Returns a state (S,) with setpoints that pull as little as those of another one: its own, moved along.
-
-    They are those of actuators that pull the more the farther away they are from their setpoints, in `ctrl`
-    or `act`.
-    """
-    model, data, physics = instance.model, instance.data, instance.physics
-    lengths = []
-    for one in (state, now):
-        physics.write(one)
-        lengths.append(data.actuator_length.copy())
-    moved = now.copy()
-    for i in range(model.nactuator):
-        gain, bias = model.actuator_gainprm[i, 0], model.actuator_biasprm[i, 1]
-        if model.actuator_biastype[i] and bias and gain:
-            by = -bias / gain * (lengths[1] - lengths[0])[model.actuator_outadr[i]]
-            at = model.actuator_actadr[i]
-            has_act = model.actuator_dyntype[i] and at >= 0
-            column = (
-                physics.columns["act"][at]
-                if has_act
-                else physics.columns["ctrl"][model.actuator_ctrladr[i]]
-            )
-            moved[column] += by
-    return moved
-
-
-def _equal_to(place: np.ndarray, table: np.ndarray) -> Callable[[np.ndarray], np.ndarray] | None:
-    """Returns what puts another place (d,) where numbers (k,) hold a place; None if they do not.
-
-    Whole numbers that stand alone may be anything else, and so may zeros.
-    """
-    d, at = len(place), []
-    if place.any() and (d > 1 or not float(place[0] * 2).is_integer()):
-        at = [i for i in range(len(table) - d + 1) if np.array_equal(table[i : i + d], place)]
-    if not at:
-        return None
-
-    def put(other: np.ndarray) -> np.ndarray:
-        found = table.copy()
-        for i in at:
-            found[i : i + d] = other
-        return found
-
-    return put
-
-
-def _is_set_by_reset(spec: EnvironmentSpec, name: str, other: np.ndarray) -> bool:
-    """Returns whether a reset gives an attribute its numbers, where it holds other ones (k,) before."""
-    instance = Instance(spec)
-    instance.reset()
-    usual = instance.memory()
-    _set(instance, {name: other})
-    try:
-        instance.reset()
-    except BadInput:  # it cannot, from there
-        return True
-    return name not in differing(instance.memory(), usual)
-
-
-# ---- the trials
-
-
 def check_noted(spec: EnvironmentSpec, resets: Resets) -> None:
     """Raises `BadInput` if a run from a start on the chart is not as a reset to there would have it go.
 
-    Runs are played after the reset as it is, and where what follows the place has been moved along. Both have
-    to go alike, to their ends and under inputs that do not change, which lead far away.
+    Runs that are put to a start are compared with the same ones where what follows the place has been moved
+    along, where the reset finds the robot at the start, and where a reset leads there by itself. Their inputs
+    do not change, which leads far away.
     """
     _check_ties(spec, resets)
     _check_following(spec, resets)
@@ -138,71 +73,120 @@ def _check_ties(spec: EnvironmentSpec, resets: Resets) -> None:
             )
 
 
+# ---- two runs from one start
+
+
+def _check_alike(
+    spec: EnvironmentSpec,
+    ours: Iterable[Seen],
+    theirs: Iterable[Seen],
+    noted: Sequence[str],
+    since: int = 0,
+    rounding: float = 0.0,
+) -> None:
+    """Raises `BadInput` if two runs differ before the end of the first.
+
+    Args:
+        spec: what is known of the environment.
+        ours, theirs: what is seen of them: one is put to the start, the other begins there as a reset does.
+        noted: the names of what differs between them.
+        since: the sample with which both begin.
+        rounding: by how much numbers may differ, as a share.
+    """
+    for k, (a, b) in enumerate(zip(to_end(ours), theirs, strict=False), since):
+        # The first reward after a start is of what shapes it, and alone it is not judged by.
+        first = 0 if "reward" in spec.criterion.asked or k > 1 else 1
+        here, there = (
+            np.concatenate([one.state[spec.places], one.observation, one.report[first:]])
+            for one in (a, b)
+        )
+        if not np.allclose(here, there, rtol=rounding, atol=rounding, equal_nan=True):
+            raise _not_its_own(spec, noted)
+
+
+def _not_its_own(spec: EnvironmentSpec, noted: Sequence[str]) -> BadInput:
+    names = ", ".join(noted[:4]) or "no attribute tells where"
+    return BadInput(
+        f"reset() of {spec.name} notes where it leads to ({names}), and step() goes by that, so a start "
+        "elsewhere on the chart is none of its own: let the first step() note it, pin it, or give "
+        "starts='reset' if all resets lead to one place"
+    )
+
+
+# ---- what follows the place is moved along
+
+
 def _check_following(spec: EnvironmentSpec, resets: Resets) -> None:
-    """Raises `BadInput` if runs depend on what follows the place over resets, and is not at the start's."""
+    """Raises `BadInput` if runs depend on what follows the place, and is not at the start's."""
     rng, usual, other = np.random.default_rng(11), Instance(spec), Instance(spec)
-    model, states = usual.model, resets.states
-    drawn = bool(np.ptp(spec.z(states), axis=0).any())
-    terms = terms_of(spec, model, states)
-    columns = usual.physics.columns
-    passed = {*columns["time"], *columns["warmstart"], *own_of(spec, model)}
-    free = np.array([i for i in range(states.shape[1]) if i not in passed], dtype=int)
-    names = [f"{kind}[{i}]" for kind, at in columns.items() for i in range(len(at))]
-    of_state = predicted(terms, states[:, free]) if drawn else None
-    of_memory: dict[str, Predict] = {}
-    if drawn:
-        for name, table in resets.numbers.items():
-            if np.isfinite(table).all() and (predict := predicted(terms, table)) is not None:
-                of_memory[name] = partial(_by_terms, spec, model, predict)
-    else:
-        of_memory |= _followed(usual)
-        usual.reset()
-        place = spec.state[spec.places]
-        for name, owner, key in held(usual.inner, {}):
-            name = name.removeprefix("attribute ")
-            numbers = numbers_of(owner[key])
-            put = None if numbers is None else _equal_to(place, numbers)
-            if put is not None and _is_set_by_reset(spec, name, put(place + 1.0)):
-                of_memory[name] = partial(_at_place, spec, put)
-    starts = _starts(spec, rng)
+    drawn = np.ptp(spec.z(resets.states), axis=0).any()
+    moved_along, follow = _of_draws(usual, resets) if drawn else _of_one_place(usual)
+    starts, none = _starts(spec, rng), np.zeros((spec.max_steps + 1, spec.dimension))
+    # So far away that limits on it show.
+    far = {name: 3 * np.ptp([of(s) for s in starts], axis=0) for name, of in follow.items()}
     for i, state in enumerate(starts):
+        moved = moved_along(state)
+        names = [usual.physics.names[at] for at in np.flatnonzero(moved != state)]
+        if not (follow or names):
+            return
+        usual, inputs = renewed(usual), [usual.drawn(rng)] * spec.max_steps
+        run = usual.play(state, inputs, none)
+        ours = [next(run)]
+        if usual.physics.depth(spec.solid) > spec.depth:
+            continue
+        ours += to_end(run)
+        values = {name: of(state) for name, of in follow.items()}
+        tries = [(ours, moved, values, [*follow, *names])]
+        for sign in (1, -1) if follow and i < EPISODES // 2 else ():
+            away = {name: values[name] + sign * far[name] for name in follow}
+            tries.append((ours[:NATURAL], state, away, [*follow]))
+        for seen, start, noted, what in tries:
+            other = renewed(other)
+            other.noted = partial(_set, other, noted)
+            try:
+                _check_alike(spec, seen, other.play(start, inputs, none), what)
+            except BadInput:  # also of one that fails with values that it does not know
+                raise _not_its_own(spec, what) from None
+
+
+def _of_draws(usual: Instance, resets: Resets) -> tuple[Predict, dict[str, Predict]]:
+    """Returns what moves a state (S,) along with its place, and what gives numbers of attributes there.
+
+    Both are of what follows the place over resets, which draw it.
+    """
+    columns, states = usual.physics.columns, resets.states
+    passed = [columns["time"], columns["warmstart"], own_of(usual)]
+    free = np.setdiff1d(np.arange(states.shape[1]), np.concatenate(passed))
+    of_state = predicted(usual, states, states[:, free])
+
+    def moved_along(state: np.ndarray) -> np.ndarray:
         moved = state.copy()
         if of_state is not None:
-            now = of_state(terms_of(spec, model, state[None])[0])
+            now = of_state(state)
             changes = np.abs(now - state[free]) > 1e-9 * np.maximum(np.abs(now), 1.0)
             moved[free[changes]] = now[changes]
-        elif not drawn:
-            usual.reset()
-            moved = _setpoints(usual, spec.state, state)
-            for kind in ("mocap_pos", "userdata"):
-                put_to = _equal_to(spec.state[spec.places], state[columns[kind]])
-                if put_to is not None:
-                    moved[columns[kind]] = put_to(state[spec.places])
-        what = [*of_memory, *(names[i] for i in np.flatnonzero(moved != state))]
-        if not what:
-            return
-        usual = _renewed(usual)
-        ours = _played(usual, state, [usual.drawn(rng)] * spec.max_steps)
-        if usual.physics.depth(spec.solid) > spec.depth and len(ours) == 1:
-            continue
-        values = {name: predict(state) for name, predict in of_memory.items()}
-        other = _compare_noted(other, ours, moved, values, what)
-        if not of_memory or i >= EPISODES // 2:
-            continue
-        far = {n: 3 * np.ptp([p(s) for s in starts], axis=0) for n, p in of_memory.items()}
-        for sign in (1, -1):  # so far that limits on it show
-            changed = {n: values[n] + sign * far[n] for n in values}
-            other = _compare_noted(other, ours[:NATURAL], state, changed, [*of_memory])
+        return moved
+
+    return moved_along, following(usual, states, resets.numbers)
 
 
-def _by_terms(
-    spec: EnvironmentSpec, model: mujoco.MjModel, predict: Predict, state: np.ndarray
-) -> np.ndarray:
-    return predict(terms_of(spec, model, state[None])[0])
+def _of_one_place(usual: Instance) -> tuple[Predict, dict[str, Predict]]:
+    """Returns the same where resets lead to one place: of what holds or follows it, or pulls there."""
+    spec, columns, follow = usual.spec, usual.physics.columns, _followed(usual)
+    usual.reset()
+    for name, numbers in numbers_in(usual.inner).items():
+        put = _equal_to(spec, numbers)
+        if put is not None and _is_set_by_reset(spec, name, put(spec.state + 1.0)):
+            follow[name] = put
 
+    def moved_along(state: np.ndarray) -> np.ndarray:
+        moved = _setpoints(usual, spec.state, state)
+        for kind in ("mocap_pos", "userdata"):
+            if (put := _equal_to(spec, state[columns[kind]])) is not None:
+                moved[columns[kind]] = put(state)
+        return moved
 
-def _at_place(spec: EnvironmentSpec, put: Predict, state: np.ndarray) -> np.ndarray:
-    return put(state[spec.places])
+    return moved_along, follow
 
 
 def _followed(instance: Instance) -> dict[str, Predict]:
@@ -210,162 +194,106 @@ def _followed(instance: Instance) -> dict[str, Predict]:
 
     After resets these follow it, too.
     """
-    spec, rng, states = instance.spec, np.random.default_rng(14), list[np.ndarray]()
-    numbers: dict[str, list[np.ndarray]] = {}
+    rng, states = np.random.default_rng(14), list[np.ndarray]()
+    rows = list[dict[str, np.ndarray]]()
     for _ in range(EPISODES):
         instance.reset()
         for _ in chain([None], instance.wander(rng, SAMPLES, HELD)):
             states.append(instance.physics.read())
-            for name, owner, key in held(instance.inner, {}):
-                if (found := numbers_of(owner[key])) is not None:
-                    numbers.setdefault(name.removeprefix("attribute "), []).append(found)
-    terms, model = terms_of(spec, instance.model, np.array(states)), instance.model
-    followed: dict[str, Predict] = {}
-    for name, rows in numbers.items():
-        if len(rows) < max(len(states), 3 * terms.shape[1]) or len({len(row) for row in rows}) > 1:
-            continue
-        table = np.array(rows)
-        if np.isfinite(table).all() and (predict := predicted(terms, table)) is not None:
-            followed[name] = partial(_by_terms, spec, model, predict)
-    return followed
+            rows.append(numbers_in(instance.inner))
+    met = np.array(states)
+    enough = len(met) >= 3 * terms_of(instance, met).shape[1]
+    return following(instance, met, tabled(rows)) if enough else {}
 
 
-def _renewed(instance: Instance) -> Instance:
-    """Returns what can play another run: an instance, or a new one if something outlasts its resets."""
-    instance.noted = None
-    if instance.spec.anew or instance.renew():
-        instance = Instance(instance.spec)
-        instance.renew()  # what it is like when it is new
-    return instance
+def _equal_to(spec: EnvironmentSpec, numbers: np.ndarray) -> Predict | None:
+    """Returns what puts another place where numbers (k,) hold that of the reset; None if they do not.
 
-
-# What is seen, and the inputs (m,) that go on from there.
-Sample = tuple[Seen, np.ndarray]
-
-
-def _played(instance: Instance, start: np.ndarray, inputs: list[np.ndarray]) -> list[Sample]:
-    """Returns the samples of a run from a start (S,) to its end; one alone if that is inside of something."""
-    none, found = np.zeros((len(inputs) + 1, instance.spec.dimension)), list[Sample]()
-    for seen, u in zip(instance.play(start, inputs, none), [*inputs, inputs[-1]], strict=True):
-        found.append((seen, u))
-        inside = instance.physics.depth(instance.spec.solid) > instance.spec.depth
-        if any(seen.report[1:3]) or (len(found) == 1 and inside):
-            break
-    return found
-
-
-def _compare_noted(
-    other: Instance,
-    ours: list[Sample],
-    start: np.ndarray,
-    noted: dict[str, np.ndarray],
-    what: list[str],
-) -> Instance:
-    """Plays a run from a start (S,) where what a reset noted has other values, and returns what played it.
-
-    Args:
-        other: plays it, or a new one.
-        ours: the samples of the run where all is as the reset has left it.
-        start: MuJoCo's state (S,).
-        noted: the values (k,), by name.
-        what: the names of all that is changed, for the message.
-
-    Raises:
-        BadInput: it goes otherwise.
+    Whole numbers that stand alone may be anything else, and so may zeros.
     """
-    spec, other = other.spec, _renewed(other)
-    other.noted = lambda: _set(other, noted)
-    inputs = [u for _, u in ours[:-1]]
-    theirs = other.play(start, inputs, np.zeros((len(ours), spec.dimension)))
-    for k, (seen, _) in enumerate(ours):
-        try:
-            pair = seen, next(theirs)
-        except BadInput:  # it fails with values that it does not know
-            raise _not_its_own(spec, what) from None
-        # The first reward after a start is of what shapes it, and alone it is not judged by.
-        first = 0 if "reward" in spec.criterion.asked or k > 1 else 1
-        a, b = (
-            np.concatenate([s.state[spec.places], s.observation, s.report[first:]]) for s in pair
-        )
-        if not np.array_equal(a, b, equal_nan=True):
-            raise _not_its_own(spec, what)
-    return other
+    place, at = spec.state[spec.places], list[int]()
+    d = len(place)
+    if place.any() and (d > 1 or not float(place[0] * 2).is_integer()):
+        at = [i for i in range(len(numbers) - d + 1) if np.array_equal(numbers[i : i + d], place)]
+    if not at:
+        return None
+
+    def put(state: np.ndarray) -> np.ndarray:
+        found = numbers.copy()
+        for i in at:
+            found[i : i + d] = state[spec.places]
+        return found
+
+    return put
 
 
-def _set(instance: Instance, noted: dict[str, np.ndarray]) -> None:
+def _is_set_by_reset(spec: EnvironmentSpec, name: str, other: np.ndarray) -> bool:
+    """Returns whether a reset gives an attribute its numbers, where it holds other ones (k,) before."""
+    instance = Instance(spec)
+    instance.reset()
+    usual = instance.memory()
+    _set(instance, {name: other})
+    try:
+        instance.reset()
+    except BadInput:  # it cannot, from there
+        return True
+    return name not in differing(instance.memory(), usual)
+
+
+def _setpoints(instance: Instance, state: np.ndarray, now: np.ndarray) -> np.ndarray:
+    """Returns a state (S,) with setpoints that pull as little as those of another one: its own, moved along.
+
+    They are those of actuators that pull the more the farther away they are from their setpoints, in `ctrl`
+    or `act`.
+    """
+    model, data, physics = instance.model, instance.data, instance.physics
+    lengths = []
+    for one in (state, now):
+        physics.write(one)
+        lengths.append(data.actuator_length.copy())
+    moved = now.copy()
+    gain, bias = model.actuator_gainprm[:, 0], model.actuator_biasprm[:, 1]
+    for i in np.flatnonzero((model.actuator_biastype != 0) & (gain != 0) & (bias != 0)):
+        kind, at = "ctrl", model.actuator_ctrladr[i]
+        if model.actuator_dyntype[i] and model.actuator_actadr[i] >= 0:
+            kind, at = "act", model.actuator_actadr[i]
+        away = (lengths[1] - lengths[0])[model.actuator_outadr[i]]
+        moved[physics.columns[kind][at]] -= bias[i] / gain[i] * away
+    return moved
+
+
+def _set(instance: Instance, values: dict[str, np.ndarray]) -> None:
     """Sets attributes and parts of the model to numbers (k,), by name."""
-    for name, owner, key in [*held(instance.inner, {})]:
-        if (numbers := noted.get(name.removeprefix("attribute "))) is not None:
-            old = owner[key]
-            if isinstance(old, np.ndarray) and old.flags.writeable:
-                old[...] = numbers.reshape(old.shape)  # it may be known by several names
-            else:
-                owner[key] = _like(old, list(numbers))
-    for name in noted:
+    set_numbers(instance.inner, values)
+    for name in values:
         if name.endswith(OF_MODEL):
             part = getattr(instance.model, name.removesuffix(OF_MODEL))
-            part[...] = noted[name].reshape(part.shape)
+            numbers = np.where(np.isnan(values[name]), part.ravel(), values[name])
+            part[...] = numbers.reshape(part.shape)
 
 
-def _like(old: Any, numbers: list[Any]) -> Any:
-    """Returns what has the form of a value, of numbers that are taken away."""
-    if isinstance(old, dict):
-        return {key: _like(part, numbers) for key, part in old.items()}
-    if isinstance(old, tuple) and hasattr(old, "_fields"):
-        return type(old)(*(_like(part, numbers) for part in old))
-    if isinstance(old, list | tuple | deque):
-        return type(old)(_like(part, numbers) for part in old)
-    if isinstance(old, np.ndarray):
-        values = np.array([numbers.pop(0) for _ in range(old.size)]).reshape(old.shape)
-        return values if _are_parts(values, old.dtype) else values.astype(old.dtype)
-    number = numbers.pop(0)
-    return number if _are_parts(number, type(old)) else type(old)(number)
-
-
-def _are_parts(numbers: Any, kind: Any) -> bool:
-    """Returns whether numbers are not those that a kind of whole numbers holds."""
-    return np.issubdtype(kind, np.integer) and not np.array_equal(numbers, np.rint(numbers))
-
-
-def _not_its_own(spec: EnvironmentSpec, what: list[str]) -> BadInput:
-    return BadInput(
-        f"reset() of {spec.name} notes where it leads to ({', '.join(what[:4])}), and step() goes by that, "
-        "so a start elsewhere on the chart is none of its own: let the first step() note it, or give "
-        "starts='reset' if all resets lead to one place"
-    )
+# ---- the reset finds the robot at the start
 
 
 def _check_led(spec: EnvironmentSpec) -> None:
-    """Raises `BadInput` if runs depend on what a reset computes of the place in MuJoCo that it leads to.
-
-    The other reset finds the robot at the start itself.
-    """
+    """Raises `BadInput` if runs depend on what a reset computes of the place in MuJoCo that it leads to."""
     rng, usual, led = np.random.default_rng(11), Instance(spec), Instance(spec)
-    none = np.zeros((spec.max_steps + 1, spec.dimension))
-    first = 0 if "reward" in spec.criterion.asked else 1  # of the report, by which it is judged
+    none = np.zeros((spec.max_steps, spec.dimension))
     for state in _starts(spec, rng):
         inputs = [usual.drawn(rng)] * spec.max_steps
-        usual, led = map(_renewed, (usual, led))
-        ours, theirs = (one.play(state, inputs, none) for one in (usual, led))
-        next(ours)
+        usual, led = map(renewed, (usual, led))
+        usual.put(state)
+        led.follow = _Leading(led, state)
         try:
-            led.follow = _Leading(led, state)
-            next(theirs)
+            led.put(state)
         except BadInput:  # it cannot begin there
             continue
-        finally:
-            led.follow = None
         noted = differing(led.memory(), usual.memory())
         if not noted:
             return
-        if usual.physics.depth(spec.solid) > spec.depth:
-            continue
-        for pair in zip(ours, theirs, strict=True):
-            a, b = (np.concatenate([*seen[:2], seen.report[first:]]) for seen in pair)
-            if not np.array_equal(a, b, equal_nan=True):
-                raise _not_its_own(spec, noted[:1])
-            if any(pair[0].report[1:3]):
-                break
+        if usual.physics.depth(spec.solid) <= spec.depth:
+            ours, theirs = (one.goes_on(inputs, none) for one in (usual, led))
+            _check_alike(spec, ours, theirs, noted[:1], since=1)
 
 
 class _Leading:
@@ -388,6 +316,33 @@ class _Leading:
         for kind, i, value in self._values:
             getattr(self._instance.data, kind)[i] = value
         return self
+
+
+# ---- resets lead elsewhere by themselves
+
+
+def _check_natural(spec: EnvironmentSpec, resets: Resets) -> None:
+    """Raises `BadInput` if a run that a reset begins goes otherwise than one that is put to the same place.
+
+    The robot is put there as that reset left it, and all else is as the reset left it that runs begin with.
+    """
+    usual, rng = Instance(spec), np.random.default_rng(12)
+    own = np.append(own_of(usual), usual.physics.columns["warmstart"])
+    n = min(NATURAL, spec.max_steps)
+    none = np.zeros((n + 1, spec.dimension))
+    for natural in _naturals(spec, resets):
+        state = spec.state.copy()
+        state[own] = natural.physics.read()[own]
+        if natural.physics.depth(spec.solid) > spec.depth:
+            continue
+        inputs, usual = [usual.drawn(rng)] * n, renewed(usual)
+        runs = [natural.goes_on(inputs, none[1:]), usual.play(state, inputs, none)]
+        next(runs[1])
+        noted = differing(natural.memory(), usual.memory())
+        # Wrappers may have seen another first observation, where the reset shows what is not up to date.
+        passed: dict[str, Any] = {"observation": np.empty(0)} if spec.wrapped else {}
+        theirs, ours = ((seen._replace(**passed) for seen in run) for run in runs)
+        _check_alike(spec, theirs, ours, noted, since=1, rounding=SAME)
 
 
 def _naturals(spec: EnvironmentSpec, resets: Resets) -> Iterator[Instance]:
@@ -450,7 +405,7 @@ def _resets_moved(instance: Instance, name: str, by: np.ndarray) -> bool:
     if in_place:
         old[...] = numbers.reshape(old.shape)  # it may be known by several names
     else:
-        _put(owner, key, _like(old, numbers.tolist()))
+        _put(owner, key, like(old, numbers.tolist()))
     instance.follow = _Leading(instance, None)
     try:
         instance.reset()
@@ -470,47 +425,3 @@ def _put(owner: Any, key: Any, value: Any) -> None:
         owner[key] = value
     else:
         setattr(owner, key, value)
-
-
-def _check_natural(spec: EnvironmentSpec, resets: Resets) -> None:
-    """Raises `BadInput` if a run that a reset begins goes otherwise than one that is put to the same place.
-
-    The robot is put there as that reset left it, and all else is as the reset left it that runs begin with.
-    """
-    usual, rng = Instance(spec), np.random.default_rng(12)
-    own = np.append(own_of(spec, usual.model), usual.physics.columns["warmstart"])
-    n = min(NATURAL, spec.max_steps)
-    none = np.zeros((n + 1, spec.dimension))
-    for natural in _naturals(spec, resets):
-        state = spec.state.copy()
-        state[own] = natural.physics.read()[own]
-        if natural.physics.depth(spec.solid) > spec.depth:
-            continue
-        inputs = [usual.drawn(rng)] * n
-        seen = natural.goes_on(inputs, none[1:])
-        usual = _renewed(usual)
-        other = usual.play(state, inputs, none)
-        next(other)
-        noted = differing(natural.memory(), usual.memory())
-        for k, (a, b) in enumerate(zip(seen, other, strict=True)):
-            # Wrappers may have seen another first observation, where the reset shows what is not up to date.
-            here, there = (
-                np.concatenate(
-                    [
-                        one.state[spec.places],
-                        [] if spec.wrapped else one.observation,
-                        one.report[0 if k else 1 :],
-                    ]
-                )
-                for one in (a, b)
-            )
-            if not np.allclose(here, there, rtol=SAME, atol=SAME, equal_nan=True):
-                told = ", ".join(noted[:4]) or "no attribute tells what"
-                raise BadInput(
-                    f"a run of {spec.name} that begins where another reset leads to goes otherwise after "
-                    f"{k + 1} sample(s) than that reset has it go: what resets set to where they lead to "
-                    f"stays elsewhere ({told}). Let the first step() note it, pin it, or "
-                    "give starts='reset' if all resets lead to one place"
-                )
-            if any(a.report[1:3]):
-                break

@@ -10,11 +10,11 @@ import numpy as np
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.gym_import.fingerprint import differing
-from hyrl_mj.gym_import.instance import Instance
+from hyrl_mj.gym_import.instance import Instance, renewed
 from hyrl_mj.gym_import.observations import flat, observers
 from hyrl_mj.gym_import.plant import EnvironmentPlant, check_finite
 from hyrl_mj.gym_import.pool import Pool
-from hyrl_mj.gym_import.specification import MOVED, Derived
+from hyrl_mj.gym_import.specification import MOVED, Derived, EnvironmentSpec
 from hyrl_mj.gym_import.stage import Played
 
 # Episodes and samples of a trial, and for how many samples inputs are held.
@@ -107,14 +107,14 @@ def _rounds(off: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.asarray(off <= 1e-9 * max(float(sizes.max(initial=0.0)), 1.0))
 
 
-def check_observer(instance: Instance) -> np.ndarray:
+def check_observer(spec: EnvironmentSpec) -> np.ndarray:
     """Returns `recalled` of a spec; raises `BadInput` if other columns depend on the way to a state.
 
     Runs under the same inputs are put into one state. What they observe there has to be the same to the bit:
     what is stored on the way differs, if only by rounding.
     """
-    spec, name, usual = instance.spec, instance.name, dict[int, np.ndarray]()
-    fresh = Instance(spec)
+    name, usual = spec.name, dict[int, np.ndarray]()
+    instance, fresh = Instance(spec), Instance(spec)
     fresh.reset()
     none, recalled = np.zeros(spec.dimension), np.zeros(1, dtype=bool)
     states = spec.state_at(spec.anywhere(np.random.default_rng(7), PLACES))
@@ -122,9 +122,9 @@ def check_observer(instance: Instance) -> np.ndarray:
     runs = [(state, AWAY) for state in states]
     runs += [(state, spec.max_steps) for state in states[:FAR]]
     for state, away in runs:
-        instance.reset()
+        instance = renewed(instance)
         instance.physics.write(state)
-        if instance.physics.depth(instance.spec.solid) > spec.depth:
+        if instance.physics.depth(spec.solid) > spec.depth:
             continue
         for k, result in enumerate(instance.wander(np.random.default_rng(8), away, HELD), 1):
             if any(result[2:4]) or (k != AWAY and k % HELD):
@@ -244,44 +244,58 @@ def _runs(
         yield plant, u if spec.levels is None else np.round(u)
 
 
-def check_instances(pool: Pool) -> None:
-    """Raises `BadInput` unless instances go as new ones after other episodes, with noise and without."""
-    spec, everyone = pool.spec, np.arange(EPISODES)
+def check_episodes(pool: Pool) -> None:
+    """Raises `BadInput` unless instances go as new ones after other episodes, and later episodes as a first.
+
+    Some runs are judged in a process of their own each. More are judged one after the other in one, and by
+    an environment that is never replaced: neither what outlasts its resets nor what these draw may matter.
+    """
+    pool.check(_episodes(pool, 3, EPISODES), processes=EPISODES)
+    pool.check(_episodes(pool, 4, 2 * EPISODES), processes=1)
+
+
+def check_noise(pool: Pool) -> None:
+    """Raises `BadInput` unless instances go as new ones under noise."""
+    pool.check(_episodes(pool, 5, EPISODES, MOVED))
+
+
+def _episodes(pool: Pool, seed: int, n: int, share: float = 0.0) -> list[Played]:
+    """Returns n runs from starts at random, under noise of a share of the sides of the chart."""
+    spec, everyone = pool.spec, np.arange(n)
     d, o = spec.dimension, spec.columns
-    for seed, share in enumerate((0.0, 0.0, MOVED)):
-        rng, bound = np.random.default_rng(seed), share * spec.chart.sides * spec.noisy
-        starts, inputs, noises, told = [], [], [], []
-        for plant, u in _runs(pool, 3 + seed):
-            starts.append(plant.state)
-            noises.append(rng.uniform(-bound, bound, (EPISODES, d)))
-            told.append(_observed(plant, noises[-1]))
-            plant.step(u)
-            inputs.append(u)
-        noises.append(np.zeros((EPISODES, d)))
+    rng, bound = np.random.default_rng(seed), share * spec.chart.sides * spec.noisy
+    starts, inputs, noises, told = [], [], [], []
+    for plant, u in _runs(pool, seed, n):
+        starts.append(plant.state)
+        noises.append(rng.uniform(-bound, bound, (n, d)))
         told.append(_observed(plant, noises[-1]))
-        u, path, noise = np.array(inputs), np.array(told), np.array(noises)
-        over = path[:, :, -1] != 0
-        ends = np.where(over.any(axis=0), over.argmax(axis=0), len(u))
-        last, cut = path[ends, everyone], ends == spec.max_steps
-        outcome = np.where(
-            cut & (last[:, -1] == 0), spec.criterion.verdict(last[:, -2] > 0), last[:, -1]
+        plant.step(u)
+        inputs.append(u)
+    noises.append(np.zeros((n, d)))
+    told.append(_observed(plant, noises[-1]))
+    plant.end()
+    u, path, noise = np.array(inputs), np.array(told), np.array(noises)
+    over = path[:, :, -1] != 0
+    ends = np.where(over.any(axis=0), over.argmax(axis=0), len(u))
+    last, cut = path[ends, everyone], ends == spec.max_steps
+    outcome = np.where(
+        cut & (last[:, -1] == 0), spec.criterion.verdict(last[:, -2] > 0), last[:, -1]
+    )
+    if not spec.wrapped:  # at an end that is known nothing is observed any more
+        noise[ends, everyone] = 0.0
+    return [
+        Played(
+            starts[0][i],
+            u[:end, i],
+            path[: end + 1, i, :d],
+            int(outcome[i]),
+            bool(cut[i]),
+            path[: end + 1, i, d : d + o],
+            noise[: end + 1, i],
+            path[1 : end + 1, i, d + o : d + o + 1],
         )
-        if not spec.wrapped:  # at an end that is known nothing is observed any more
-            noise[ends, everyone] = 0.0
-        played = [
-            Played(
-                starts[0][i],
-                u[:end, i],
-                path[: end + 1, i, :d],
-                int(outcome[i]),
-                bool(cut[i]),
-                path[: end + 1, i, d : d + o],
-                noise[: end + 1, i],
-                path[1 : end + 1, i, d + o : d + o + 1],
-            )
-            for i, end in enumerate(ends)
-        ]
-        pool.check(played, alone=not seed)
+        for i, end in enumerate(ends)
+    ]
 
 
 def _observed(plant: EnvironmentPlant, noise: np.ndarray) -> np.ndarray:
