@@ -377,19 +377,21 @@ def test_what_is_done_is_not_done_again(result, folder, monkeypatch):
     assert said == ["seed 0: done before"]
 
 
-def test_a_file_makes_an_alternative_which_may_not_fit(result, folder, small, monkeypatch):
+@pytest.mark.parametrize("mistake", [Unfit("nothing fits it"), BadInput("nothing fits it")])
+def test_a_file_makes_an_alternative_which_may_not_fit(mistake, result, folder, small, monkeypatch):
     monkeypatch.setattr(base, "_KNOWN", dict(base._KNOWN))
 
     @register
     class Never(Alternative):
-        name, title, sentence = "never", "never", "It fits nothing."
+        name, title = f"never-{type(mistake).__name__}", "never"
+        sentence = "It fits nothing."
 
         def candidates(self, given):
             yield Candidate("first", given.run.controllers["policy"])
-            raise Unfit("nothing fits it")
+            raise mistake
 
-    found = hyrl_mj.compare("unit_circle", out=folder, only=("never",), say=len, **RUNS)
-    row = found.row("never", 0)
+    found = hyrl_mj.compare("unit_circle", out=folder, only=(Never.name,), say=len, **RUNS)
+    row = found.row(Never.name, 0)
     assert (row.state, row.sentence) == ("unfit", "nothing fits it")
     assert any("nothing fits it" in sentence for sentence in sentences(found))
 

@@ -136,14 +136,25 @@ def _told(row: Row) -> str:
 
 def judged(made: Run, name: str, *, seed: int) -> Row:
     """Returns the row of an alternative: the best of its settings, judged as HyRL is."""
-    from hyrl_mj.alternatives import Given, Unfit, registered
+    from hyrl_mj.alternatives import registered
 
-    alternative, began = registered()[name], time.monotonic()
-    row = Row(name, alternative.title, seed)
+    row = Row(name, registered()[name].title, seed)
     try:
-        candidates = [*alternative.candidates(Given(made, seed))]
-    except Unfit as error:
+        return _made(made, row)
+    except BadInput as error:  # the others go on
         return replace(row, state="unfit", sentence=str(error))
+
+
+def _made(made: Run, row: Row) -> Row:
+    """Returns the row of an alternative with its results.
+
+    Raises:
+        BadInput: it does not fit the task.
+    """
+    from hyrl_mj.alternatives import Given, registered
+
+    began, seed = time.monotonic(), row.seed
+    candidates = [*registered()[row.name].candidates(Given(made, seed))]
     one = len(candidates) == 1
     scores = [0.0 if one else _worst(made, each.controller, seed) for each in candidates]
     best = candidates[int(np.argmax(scores))]
