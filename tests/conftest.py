@@ -125,7 +125,7 @@ def planted_circle(made_once):
 
     As on a machine that cannot draw: there is no video.
     """
-    from planted import FEW_CELLS, decisions, halves, without_pdfs
+    from planted import FEW_CELLS, decisions, halves, without_pictures
     from test_report import plant
 
     def no_renderer(*arguments, **options):
@@ -136,7 +136,7 @@ def planted_circle(made_once):
         plant(path, task, decisions(task), halves(task), **FEW_CELLS)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("hyrl_mj.viz.replay.render_replay", no_renderer)
-            without_pdfs(patch)
+            without_pictures(patch)
             hyrl_mj.run("unit_circle", preset="smoke", set=FEW_CELLS, out=path, say=said.append)
         (folder / "said.json").write_text(json.dumps(said))
 
@@ -151,6 +151,16 @@ def small_runs():
 
     with pytest.MonkeyPatch.context() as patch:
         shorten(patch)
+        yield
+
+
+@pytest.fixture(scope="module")
+def few_trials():
+    """While the tests of a file run, environments are looked at for a shorter time."""
+    from planted import few_trials
+
+    with pytest.MonkeyPatch.context() as patch:
+        few_trials(patch)
         yield
 
 

@@ -12,6 +12,7 @@ from PIL import Image
 
 from hyrl_mj.files.artifacts import digest
 from hyrl_mj.files.manifest import FILES, Entry, Manifest
+from hyrl_mj.gym_import import draws, resets, starts, trials, uses
 from hyrl_mj.gym_import.task import EnvironmentTask
 from hyrl_mj.judging import worst_case as examination
 from hyrl_mj.judging.proof import cells, counterexamples, replays
@@ -90,6 +91,19 @@ def spare_environments(patch):
     few = {"batches": 1, "nodes": 6, "episodes": 24}
     patch.setattr(EnvironmentTask, "effort", replace(EnvironmentTask.effort, **few))
     patch.setattr(judges, "ATTACKED", 12)
+
+
+def few_trials(patch):
+    """Patches how often an environment is reset and played before it is used.
+
+    What these trials have to find is found in so few, too. That they refuse nothing which is honest is
+    tested with all of them, in `test_trapped_environments` and `test_true_environments`.
+    """
+    few = {"EPISODES": 4, "SAMPLES": 16, "PLACES": 16, "RESETS": 24, "SELDOM": 80}
+    for module in (trials, uses, draws, starts, resets):
+        for name in few.keys() & vars(module).keys():
+            patch.setattr(module, name, few[name])
+    patch.setattr(trials._runs, "__defaults__", (few["EPISODES"],))
 
 
 def coarsen(patch):

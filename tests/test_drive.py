@@ -448,7 +448,7 @@ def test_more_noise_than_that_of_the_run_is_said(planted):
 
 def test_an_attack_is_at_least_as_bad(planted, read, monkeypatch):
     monkeypatch.setattr(drives, "ROUNDS", 1)
-    result = driven(planted, read(time_s=8), attack=True, eps=0.05)
+    result = driven(planted, read(time_s=4), attack=True, eps=0.05)
     assert set(result.attacked) == {"policy", "hyrl", "law"}
     assert result.attacked["hyrl"][0].noise == "attack"
     clearance = [
@@ -566,7 +566,13 @@ def test_the_post_in_focus_has_the_colour_of_its_side(command, written, tmp_path
 @needs_gl
 def test_a_start_at_the_goal_and_moving_posts_are_rendered(command, written, tmp_path):
     moving = {"radius_m": 0.5, "positions_m": [[-3, 0], [-3, 1]]}
-    content = {**ONE, "posts": [moving], "interval_s": 4, "starts": [start(0, 0), START]}
+    content = {
+        **ONE,
+        "posts": [moving],
+        "interval_s": 4,
+        "time_s": 7,
+        "starts": [start(0, 0), START],
+    }
     words = ["--out", tmp_path / "x.gif", "--size", "480x240", "--fps", "2", "--camera", "chase"]
     status, _, errors = command("--field", written(content), *words, "--shown", "0-1")
     assert (status, errors) == (0, "")

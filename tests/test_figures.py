@@ -12,7 +12,7 @@ from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Wedge
 from matplotlib.path import Path as Outline
-from planted import Cube, decisions, plane_policy
+from planted import Cube, decisions, plane_policy, without_pictures
 
 import hyrl_mj
 from hyrl_mj import BadInput, HybridController, Outcome, Scene, simulate
@@ -168,6 +168,8 @@ def test_every_figure_is_drawn_from_one_kind_of_value_and_has_a_caption():
 
 @pytest.mark.slow
 def test_a_new_figure_is_an_entry(tmp_path, monkeypatch):
+    without_pictures(monkeypatch)
+
     def draw_title(shown, path=None):
         with style.drawing(path, 1.0, shown.task, shown.policy_title) as figure:
             return figure

@@ -135,9 +135,8 @@ def renamed(controller):
 # Cells 0.05 m wide: at half speed the vehicle ends between two nodes. Cells 0.1 m wide: always.
 TWINS = [
     ("vehicle", (61, 31), sign_policy, (0.0, 0.05)),
-    ("vehicle", (61, 31), sign_policy, (0.0, 0.1)),
     ("vehicle", (61, 31), lambda task: renamed(ideal_controller(task, 0.2)), (0.0, 0.1)),
-    ("vehicle", (61, 61), lambda task: ideal_controller(task, 0.07), (0.0, 0.1)),
+    ("vehicle", (31, 61), lambda task: ideal_controller(task, 0.07), (0.0, 0.1)),
     ("vehicle", (61, 21), sign_policy, (0.15, 0.15)),
     ("vehicle", (31, 31), lambda task: ideal_controller(task, 0.07), (0.1, 0.1)),
     ("unit_circle", (300,), circle_policy, (0.0,)),

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from attacks import child, crafted_agents
 from command_line import call
+from environments import Puck
 from PIL import Image
 
 import hyrl_mj
@@ -273,11 +274,7 @@ def test_a_matplotlibrc_of_the_current_folder_has_no_part(tmp_path):
     code += (
         "from hyrl_mj.viz.figures import style; import matplotlib; print(matplotlib.get_backend())"
     )
-    for make in (
-        lambda path: path.write_bytes(b"\xff\xfe\xff: 3\n"),
-        lambda path: path.write_text("evilkey: x\n"),
-        os.mkfifo,
-    ):
+    for make in (lambda path: path.write_bytes(b"\xff\xfe\xff: 3\n"), os.mkfifo):
         make(tmp_path / "matplotlibrc")
         done = subprocess.run(
             [sys.executable, "-P", "-c", code],
@@ -484,8 +481,8 @@ def test_a_sweep_has_each_run_once(tmp_path):
 # ---- what speaks to the terminal, or to a spreadsheet
 
 
-def test_what_is_explained_cannot_control_the_terminal(circle):
-    task = from_gymnasium(ENV, success="terminated #\x1b[2J")
+def test_what_is_explained_cannot_control_the_terminal(few_trials):
+    task = from_gymnasium(Puck, success='info["success"] #\x1b[2J', steps=20)
     assert "\x1b" not in explained(task)
 
 

@@ -58,8 +58,7 @@ def of(tmp_path):
     ).columns[0]
 
 
-two_seeds = pytest.mark.parametrize("seed", [0, 1])
-two_times = pytest.mark.parametrize("dt", [0.05, 0.02])
+two_logs = pytest.mark.parametrize(("seed", "dt"), [(0, 0.05), (1, 0.02)])
 
 
 # ---- what was planted is found
@@ -80,8 +79,7 @@ NONE = {"bound": 0, "bias": 0, "drift": 0, "delay": 0, "held": 0, "held_rate": 0
 
 
 @pytest.mark.parametrize("kind", ALONE)
-@two_seeds
-@two_times
+@two_logs
 def test_each_quantity_is_found_alone_and_nothing_else(kind, seed, dt, of):
     plan, wanted = ALONE[kind]
     noise = of(planted(seed, dt, **plan))
@@ -95,10 +93,9 @@ def test_each_quantity_is_found_alone_and_nothing_else(kind, seed, dt, of):
     }
 
 
-@pytest.mark.parametrize("scale", [0.1, 1, 30])
+@pytest.mark.parametrize("scale", [0.1, 30])
 @pytest.mark.parametrize("kind", ["uniform", "gaussian"])
-@two_seeds
-@two_times
+@two_logs
 def test_all_together_are_found(scale, kind, seed, dt, of):
     plan = {"bias": 0.06, "drift": (0.06, 0.01), "quantum": 0.005, kind: 0.04}
     plan = {k: tuple(scale * np.array(v)) if k == "drift" else scale * v for k, v in plan.items()}

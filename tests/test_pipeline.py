@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from command_line import contents
-from planted import circle_policy, decisions, halves
+from planted import circle_policy, decisions, halves, without_pictures
 from test_report import plant
 
 import hyrl_mj
@@ -22,6 +22,12 @@ from hyrl_mj.viz.commands import beginning, commands
 pytestmark = pytest.mark.slow  # a planted run goes through all later stages
 
 NAMES = [*STAGES]
+
+
+@pytest.fixture(autouse=True)
+def blank(monkeypatch):
+    """No picture is looked at."""
+    without_pictures(monkeypatch)
 
 
 @pytest.fixture

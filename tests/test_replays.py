@@ -2,12 +2,19 @@
 
 import json
 import shutil
+from copy import copy
 from dataclasses import replace
 
 import mujoco
 import numpy as np
 import pytest
-from planted import circle_controller, halves, ideal_controller, one_way_policy
+from planted import (
+    circle_controller,
+    halves,
+    ideal_controller,
+    one_way_policy,
+    without_pictures,
+)
 from test_certificate import EPS, hybrid
 
 import hyrl_mj
@@ -38,17 +45,21 @@ def loops(vehicle):
     return {"hyrl": hybrid(vehicle)}
 
 
-@pytest.fixture
-def certificate(vehicle, loops):
+@pytest.fixture(scope="module")
+def certified(vehicle, loops):
     game = Game(vehicle, halves(vehicle), loops, EPS, grid=Grid.with_cells(vehicle.chart, 240))
     return Certificate.certify(game, loops)
 
 
+@pytest.fixture
+def certificate(certified):
+    """The certificate, with a game of its own, whose task may be changed."""
+    return replace(certified, game=copy(certified.game))
+
+
 @pytest.fixture(scope="module")
-def scores(vehicle, loops):
-    game = Game(vehicle, halves(vehicle), loops, EPS, grid=Grid.with_cells(vehicle.chart, 240))
-    names = ["hyrl", "limit"]
-    return examination._scores(Certificate.certify(game, loops), names, loops, (EPS,))[0]
+def scores(certified, loops):
+    return examination._scores(certified, ["hyrl", "limit"], loops, (EPS,))[0]
 
 
 def delayed(samples):
@@ -163,6 +174,7 @@ def test_a_run_of_which_too_much_is_proved_says_so_everywhere(
     planted_circle, tmp_path, monkeypatch, capsys
 ):
     shutil.copytree(planted_circle[0].path, path := tmp_path / "run")
+    without_pictures(monkeypatch)
     real = Certificate.value
     monkeypatch.setattr(Certificate, "value", lambda *asked: np.zeros_like(real(*asked)))
     pipeline.examine_run(hyrl_mj.load_run(path), say=print)

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from figure_parts import arcs_of, controller_of, policy_of, sets_of
-from planted import decisions, halves
+from planted import decisions, halves, without_pictures
 
 import hyrl_mj
 from hyrl_mj.learning.presets import preset
@@ -87,7 +87,8 @@ def test_a_run_of_another_task_is_refused(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_papers_seven_figures_are_written(tmp_path):
+def test_the_papers_seven_figures_are_written(tmp_path, monkeypatch):
+    without_pictures(monkeypatch)
     circle, vehicle = (planted_run(hyrl_mj.get_task(t)) for t in ("unit_circle", "vehicle"))
     script.draw(circle, vehicle, tmp_path)
     names = {path.stem.partition("_")[0] for path in tmp_path.iterdir()}

@@ -8,7 +8,8 @@ from environments import GOAL, XML, Puck
 
 from hyrl_mj import BadInput, from_gymnasium
 
-pytestmark = pytest.mark.slow  # a second for each environment
+# A second for each environment.
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_trials")]
 PLACE = np.array([-1.3, 0.5])
 MOTORS = XML[XML.index("<actuator>") + 10 : XML.index("</actuator>")]
 SERVOS = "".join(

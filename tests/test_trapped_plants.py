@@ -33,7 +33,9 @@ def test_nothing_that_is_called_won_is_lost_in_mujoco(tmp_path, seeds):
 
 @pytest.mark.slow
 def test_honest_robots_are_proved(tmp_path):
-    honest = [examined(seed * len(TRAPS), tmp_path) for seed in range(3)]
+    honest = [
+        examined(seed * len(TRAPS), tmp_path) for seed in (0, 2)
+    ]  # of one and of two coordinates
     assert {f.word for f in honest} == {"proved"}
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import call
-from planted import believe
+from planted import believe, without_pictures
 
 import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, HybridArc
@@ -28,6 +28,12 @@ EVIL = "import pathlib\npathlib.Path({marker!r}).touch()\n"
 def marker(tmp_path):
     """The file that appears if foreign code runs."""
     return tmp_path / "executed"
+
+
+@pytest.fixture(autouse=True)
+def blank(monkeypatch):
+    """No picture is looked at."""
+    without_pictures(monkeypatch)
 
 
 @pytest.fixture
@@ -51,11 +57,6 @@ def open_everything(path):
     _ = run.policy, run.robustness, run.arcs()
     for stage in ("simulate", "figures", "report"):
         run = run_stage(run, stage, say=str)
-
-
-@pytest.mark.slow
-def test_the_run_itself_opens(received):
-    open_everything(received)
 
 
 def test_a_run_that_names_a_file_as_its_task_is_refused(received, evil, marker):

@@ -11,7 +11,8 @@ from test_wrapped_environments import Flat, Home
 
 from hyrl_mj import BadInput, from_gymnasium
 
-pytestmark = pytest.mark.slow  # a second for each environment
+# A second for each environment.
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_trials")]
 
 
 class Noting(Home):

@@ -1,5 +1,6 @@
 """Wrapped environments, slow sensors, conditions and agents of users: as they are, or refused by name."""
 
+import functools
 import importlib
 import sys
 from collections import deque
@@ -13,14 +14,15 @@ from gymnasium.wrappers import DtypeObservation, TimeLimit
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.sac.policies import SACPolicy
-from test_truer_environments import STARTS, flat, outcomes, pilot, plain
+from test_truer_environments import STARTS, ends, flat, outcomes, pilot, plain
 
 from hyrl_mj import BadInput, Noise, from_callable, from_gymnasium, load_agent, simulate
 from hyrl_mj.gym_export import BatchedEnv
 from hyrl_mj.gym_export.sb3_env import TaskVecEnv
 from hyrl_mj.tasks import check_task, trial
 
-pytestmark = pytest.mark.slow  # a second for each environment
+# A second for each environment.
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_trials")]
 NARROW = spaces.Box(-np.inf, np.inf, (6,), dtype=np.float64)
 
 
@@ -263,10 +265,16 @@ class Vector(InPlace):
         self.observation_space = NARROW
 
 
+@functools.cache
+def flat_puck():
+    return from_gymnasium(Flat, steps=60)
+
+
 @pytest.mark.parametrize("env", [Puck, Listed])
 def test_wrappers_get_what_the_environment_gives_and_may_change_it(env):
-    assert outcomes(lambda: Vector(env())) == plain()
-    assert outcomes(lambda: Vector(env()), 0.1) == outcomes(Flat, 0.1)
+    task = from_gymnasium(lambda: Vector(env()), steps=60)
+    assert ends(task) == plain()
+    assert ends(task, 0.1) == ends(flat_puck(), 0.1)
 
 
 class Late(Home):
