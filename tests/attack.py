@@ -74,14 +74,14 @@ ATTACKS = {
         "killed at a random moment, resumed while the clock is set back", kills.trials, 50, 1
     ),
     "disks": Attack("a disk that is full, and then has room", disks.trials, 6, 1),
-    "artifacts": Attack("truncated, or one bit flipped", damage.trials, 20, 1),
-    "agents": Attack("crafted agents of a stranger", received.agents, 100, 1),
+    "artifacts": Attack("truncated, or one bit flipped", damage.trials, 20, 2),
+    "agents": Attack("crafted agents of a stranger", received.agents, 100, 2),
     "received": Attack("crafted run directories of a stranger", received.runs, 25, 1),
-    "doors": Attack("generated descriptions of a stranger", doors.trials, 575, 4),
+    "doors": Attack("generated descriptions of a stranger", doors.trials, 575, 8),
     "configurations": Attack(
-        "one setting changed, through every stage", configurations.trials, 200, 1
+        "one setting changed, through every stage", configurations.trials, 200, 4
     ),
-    "tasks": Attack("task file or MJCF with one mistake", tasks.trials, 100, 1),
+    "tasks": Attack("task file or MJCF with one mistake", tasks.trials, 100, 2),
     "writers": Attack("two and four writers, and a reader", writers.trials, 4, 1),
     "surroundings": Attack("pairs of bad surroundings", surroundings.trials, 4, 1),
 }

@@ -146,7 +146,7 @@ parts = st.fixed_dictionaries(
 ).filter(len)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(parts, st.sampled_from([VEHICLE, CIRCLE, "gate"]), st.integers(0, 1000))
 def test_all_parts_together_stay_within_the_bound(numbers, name, seed):
     text = " + ".join(f"{word} {value:.6g}" for word, value in numbers.items())

@@ -325,7 +325,7 @@ def test_better_is_what_the_same_starts_show(circle):
 
 def test_each_word_is_said_only_where_its_condition_holds(circle):
     rng, words = np.random.default_rng(0), []
-    for _ in range(150):
+    for _ in range(500):
         n = int(rng.choice((300, 1_000, 4_000)))
         kinds = ["none", "uniform", "alternating", "adversarial"]
         kinds = [kind for kind in kinds if rng.random() < 0.95]
