@@ -163,8 +163,9 @@ def compare(
 ) -> None:
     """Compare HyRL with what people would do instead, judged alike.
 
-    Training under noise, memory, filters, held inputs and others: each is tuned, and may train with as many
-    samples as the whole run of HyRL. What is done is not done again.
+    Each alternative is tuned, and may train with as many samples as HyRL's run.
+
+    What is done is not done again.
 
     Args:
         task: a task, see `hyrl-mj list`, or a Python file that defines one; by default none, with --env.
