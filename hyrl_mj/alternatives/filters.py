@@ -74,9 +74,8 @@ class KalmanFilter:
     def act_after(self, memory: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         task, chart = self.task, self.task.chart
         z, first = task.z(measured), memory[:, :1] == 0
-        known = np.where(
-            first, np.inf, memory[:, :1] + self.drift
-        )  # before a first measurement nothing is
+        # Nothing is known before the first measurement.
+        known = np.where(first, np.inf, memory[:, :1] + self.drift)
         gain = np.where(first, 1.0, 1 - 1 / (known + 1))
         predicted = np.where(first, z, memory[:, 1:])
         estimate = predicted + gain * chart.difference(z, predicted)

@@ -6,15 +6,16 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
 from stable_baselines3 import PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from hyrl_mj.alternatives.base import Given
 from hyrl_mj.gym_export import BatchedEnv
 from hyrl_mj.gym_export.sb3_env import TaskVecEnv
-from hyrl_mj.learning.training import threads
+from hyrl_mj.learning.training import ACTIVATIONS, spread_kinks, threads
 from hyrl_mj.policies import Controller
 from hyrl_mj.simulation import AnyNoise
 
@@ -45,7 +46,8 @@ def learned(
 ) -> Any:
     """Returns a model that was trained, with the weights of its best checkpoint.
 
-    Its settings are those of PPO in stage 1, and all samples have as many checkpoints.
+    Its settings are those of PPO in stage 1 but for the symmetry of the network and the episodes that start
+    anywhere, and all samples have as many checkpoints.
 
     Args:
         given: what may be used.
@@ -59,6 +61,10 @@ def learned(
         of_policy: arguments of the policy to change.
     """
     settings, best = given.training("ppo"), _Best(given, controller)
+    rate = settings.learning_rate
+    activation = ACTIVATIONS[settings.activation]
+    if settings.normalize:
+        env = VecNormalize(env, norm_obs=False, clip_reward=np.inf, gamma=settings.gamma)
     with threads(1):  # faster for small networks
         model: Any = algorithm(
             policy,
@@ -66,10 +72,18 @@ def learned(
             seed=given.seed,
             device="cpu",
             gamma=settings.gamma,
-            learning_rate=settings.learning_rate,
-            policy_kwargs={"net_arch": list(settings.hidden), **of_policy},
+            learning_rate=(lambda left: rate * max(left, settings.final_rate))
+            if settings.anneal
+            else rate,
+            policy_kwargs={
+                "net_arch": list(settings.hidden),
+                "activation_fn": activation,
+                **of_policy,
+            },
             **settings.options | dict(options),
         )
+        if settings.spread and start is None:
+            spread_kinks(model.policy, given.task, given.seed)
         if start is not None:
             model.policy.load_state_dict(start)
         model.learn(samples or settings.samples, callback=best)
