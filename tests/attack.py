@@ -48,8 +48,8 @@ from attacks.material import Material
 from rich.console import Console
 from rich.table import Table
 
-# Twice as many as a small machine has cores: half of their time trials wait for what never comes.
-PROCESSES = 4
+# Three times as many as a small machine has cores: for much of their time trials wait for what never comes.
+PROCESSES = 6
 
 
 @dataclass(frozen=True)

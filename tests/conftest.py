@@ -6,6 +6,7 @@ import json
 import os
 import platform
 import shutil
+from collections import Counter
 
 # Before NumPy and torch are there: matrices are small here, and threads that wait for a busy core take
 # ten times as long as none.
@@ -177,8 +178,18 @@ LONGEST += (
 LONGEST += ("surroundings", "cli", "report", "training", "tables", "doors")
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Files with slow tests come first, the longest before all: no process ends long after the other."""
+    """Of the cases of a test that is marked `first(n)`, those after the n-th are `long`.
+
+    Files with slow tests come first, the longest before all: no process ends long after the other.
+    """
+    seen = Counter()
+    for item in items:
+        if mark := item.get_closest_marker("first"):
+            seen[item.path, item.originalname] += 1
+            if seen[item.path, item.originalname] > mark.args[0]:
+                item.add_marker(pytest.mark.long)
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     places = {f"test_{name}": place for place, name in enumerate(LONGEST)}
 

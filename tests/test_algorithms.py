@@ -213,6 +213,7 @@ def values(critic, o, a):
         )
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(
     "algorithm",
     # One that learns from its latest samples, and one that keeps all of them.
@@ -292,6 +293,7 @@ def test_what_cannot_be_used_is_one_sentence_before_any_training(
 # ---- algorithms from elsewhere
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     ("kind", "task", "known"),
     [

@@ -129,6 +129,7 @@ def test_a_mistake_is_one_sentence(tmp_path, monkeypatch, mistake, caplog):
     assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
 
 
+@pytest.mark.long
 def test_starts_that_have_arrived_already_are_found(tmp_path):
     still = ((PY, CROSSED, "pass"), (PY, r"\(5\.0, 3\.0, 3\.0\)", "(9.0, 3.0, 3.0)"))
     there = (PY, r"np\.abs\(z\[:, 1\]\)", "0 * z[:, 1]")

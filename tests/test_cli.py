@@ -93,6 +93,7 @@ def test_figures_are_drawn_again(copied):
     assert (copied / "figures" / "runs.pdf").is_file()
 
 
+@pytest.mark.long
 @needs_gl
 def test_a_run_without_a_critical_set_has_one_mode_and_leaves_nothing_of_two(copied):
     run = hyrl_mj.load_run(copied)

@@ -61,6 +61,7 @@ def from_critical_set(run, arc):
 # ---- the arcs
 
 
+@pytest.mark.first(1)
 def test_the_worst_arc_is_lost_to_the_worst_noise_within_its_bound(run, worst):
     assert worst.outcome == {"unit_circle": "stalled", "vehicle": "crashed"}[run.task.name]
     assert worst.noise == "worst"
@@ -98,6 +99,7 @@ def test_the_usual_arc_begins_on_the_critical_set_under_alternating_noise(run):
 # ---- what is written and said
 
 
+@pytest.mark.long
 def test_what_is_lost_without_noise_is_said_first(tmp_path, circle, monkeypatch):
     monkeypatch.setattr(diagnosis, "render_replay", no_renderer)
     still = ChartPolicy(circle, lambda z: np.zeros((len(z), 1)))

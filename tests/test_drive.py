@@ -541,6 +541,7 @@ def near(picture, colour, off=60):
     return np.abs(picture.astype(int) - ImageColor.getrgb(colour)).sum(axis=2) < off
 
 
+@pytest.mark.long
 @needs_gl
 def test_the_post_in_focus_has_the_colour_of_its_side(command, written, tmp_path):
     shares = []
@@ -563,6 +564,7 @@ def test_the_post_in_focus_has_the_colour_of_its_side(command, written, tmp_path
     assert sorted(p.name for p in tmp_path.iterdir()) == ["field.json", "x.png"]
 
 
+@pytest.mark.long
 @needs_gl
 def test_a_start_at_the_goal_and_moving_posts_are_rendered(command, written, tmp_path):
     moving = {"radius_m": 0.5, "positions_m": [[-3, 0], [-3, 1]]}

@@ -56,6 +56,7 @@ def agent(kind, wrapped, folder):
     return model, env, folder / "agent.zip", needs
 
 
+@pytest.mark.first(4)
 @pytest.mark.parametrize("wrapped", WRAPPED)
 @pytest.mark.parametrize("kind", [PPO, SAC])
 def test_in_a_closed_loop_it_acts_as_under_sb3(kind, wrapped, puck, tmp_path):

@@ -661,6 +661,7 @@ def test_an_agent_is_diagnosed_and_made_robust_in_its_own_environment(tmp_path, 
 # ---- of other packages; last, because their many copies take memory that each new process would copy
 
 
+@pytest.mark.first(2)
 @others
 def test_copies_go_on_as_the_environment_alone_does(name, other):
     task, rng = other(name), np.random.default_rng(0)

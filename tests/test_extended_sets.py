@@ -73,6 +73,7 @@ def finely(circle):
     return Case(circle, circle_policy(circle), 121, 2880)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("noise", [0.0, 0.01, 0.05])
 @pytest.mark.slow
 def test_little_noise_leaves_no_holes_on_a_fine_grid(finely, noise):
@@ -101,6 +102,7 @@ def test_noise_widens_the_sets_when_the_horizon_is_short(on_circle):
 # ---- vehicle
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("x", [0.0, 0.1, 0.2, 0.3, 0.4])
 def test_without_noise_the_overlap_is_what_can_still_be_won(vehicle_sets, on_vehicle, x):
     cell = on_vehicle.partition.grid.cell
@@ -233,6 +235,7 @@ def test_sized_sets_survive_being_written(sized, vehicle, tmp_path):
 # ---- plants that cannot be run backward
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(("noise", "horizon"), [(0.1, None), (0.0, 0.2)])
 @pytest.mark.slow
 def test_forward_runs_give_the_sets_that_backward_ones_give(
@@ -266,6 +269,7 @@ def test_points_of_the_critical_set_that_cannot_be_used_are_refused(on_circle):
             make_partition(case.task, case.policy, points, 30)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_sets_reach_walls_that_only_stop_the_robot_and_hold_their_inside(few_trials, monkeypatch):
     puck, noise = from_gymnasium(Puck, steps=120), 0.3

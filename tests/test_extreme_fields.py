@@ -61,6 +61,7 @@ def looked_at(content, arc):
     return np.hypot(*path[-1]), least, moved
 
 
+@pytest.mark.first(3)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "seed", [*range(8), *(pytest.param(i, marks=pytest.mark.long) for i in range(8, 40))]

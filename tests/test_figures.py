@@ -80,6 +80,7 @@ def inside(outlines: list[Outline], *points):
 # ---- all of them
 
 
+@pytest.mark.first(3)
 @TASKS
 @EVERY_FIGURE
 @pytest.mark.slow

@@ -70,6 +70,7 @@ class Room(gym.Env):
         return self._get_obs(), -1.0, won, False, {"is_success": won}
 
 
+@pytest.mark.first(3)
 @pytest.mark.parametrize(
     "frame",
     [
@@ -138,6 +139,7 @@ def both(angle):
     return np.cos(angle), np.sin(angle)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(
     ("seen", "won", "periodic"),
     [

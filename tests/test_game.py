@@ -147,6 +147,7 @@ TWINS = [
 ]
 
 
+@pytest.mark.first(5)
 @pytest.mark.parametrize(("name", "counts", "controller", "bound"), TWINS)
 @pytest.mark.slow
 def test_the_game_is_its_slow_twin(vehicle, circle, name, counts, controller, bound):
@@ -464,6 +465,7 @@ def test_the_worst_signal_keeps_trapped_starts_from_arriving(circle, on_circle):
     assert max(np.abs(arc.z - PI).max() for arc in arcs) < 0.2
 
 
+@pytest.mark.first(3)
 @pytest.mark.parametrize("kind", ["worst", "uniform", "alternating", "adversarial"])
 @pytest.mark.parametrize("name", ["sign", "hysteresis"])
 def test_no_noise_makes_a_won_start_of_the_circle_late(circle, on_circle, name, kind):

@@ -481,6 +481,7 @@ def test_a_sweep_has_each_run_once(tmp_path):
 # ---- what speaks to the terminal, or to a spreadsheet
 
 
+@pytest.mark.long
 def test_what_is_explained_cannot_control_the_terminal(few_trials):
     task = from_gymnasium(Puck, success='info["success"] #\x1b[2J', steps=20)
     assert "\x1b" not in explained(task)

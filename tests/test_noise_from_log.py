@@ -78,6 +78,7 @@ ALTERNATING = np.arange(100) % 2
 NONE = {"bound": 0, "bias": 0, "drift": 0, "delay": 0, "held": 0, "held_rate": 0, "quantum": 0}
 
 
+@pytest.mark.first(12)
 @pytest.mark.parametrize("kind", ALONE)
 @two_logs
 def test_each_quantity_is_found_alone_and_nothing_else(kind, seed, dt, of):
@@ -93,6 +94,7 @@ def test_each_quantity_is_found_alone_and_nothing_else(kind, seed, dt, of):
     }
 
 
+@pytest.mark.first(6)
 @pytest.mark.parametrize("scale", [0.1, 30])
 @pytest.mark.parametrize("kind", ["uniform", "gaussian"])
 @two_logs

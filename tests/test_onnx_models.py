@@ -103,6 +103,7 @@ def test_operators_inside_local_functions_are_seen(circle, tmp_path):
     np.testing.assert_allclose(load_agent(path, circle).inputs(np.array([[1.0, 0.25]])), [[0.25]])
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_functions_that_call_each_other_without_end_are_refused(circle, tmp_path):
     calls = [node(f"F{i}", "a", "m", domain="mine") for i in range(40)]

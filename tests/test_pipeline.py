@@ -172,6 +172,7 @@ def test_a_horizon_that_cannot_be_used_changes_nothing(run):
     assert contents(run.path) == before
 
 
+@pytest.mark.long
 def test_a_run_made_for_noise_on_all_coordinates_is_examined_so(vehicle, tmp_path, monkeypatch):
     path = tmp_path / "run"
     plant(path, vehicle, decisions(vehicle), halves(vehicle, 60), eps=0.05, everywhere=True)
@@ -193,6 +194,7 @@ def test_a_run_made_for_noise_on_all_coordinates_is_examined_so(vehicle, tmp_pat
     assert np.abs(off).max() <= 0.05
 
 
+@pytest.mark.long
 def test_episodes_are_added_on_demand(run):
     before, said = run.robustness, []
     twice = ("uniform", "uniform")  # is played once

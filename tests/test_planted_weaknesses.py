@@ -107,6 +107,7 @@ def default(**options):
     return Budget(rounds=Effort().attack_rounds, **options)
 
 
+@pytest.mark.first(6)
 @pytest.mark.parametrize("name", SIGNALS)
 @pytest.mark.parametrize("make", ["one mode", "several modes"])
 def test_what_one_signal_breaks_is_broken(vehicle, name, make):

@@ -242,6 +242,7 @@ def test_it_comes_back_from_a_run_directory(wrapped, circle, tmp_path):
     assert read_agent(circle, path, **needs).agent != given.agent
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_run_on_such_an_agent_says_so_and_goes_on(small_runs, circle, tmp_path):
     _, path, needs = agent(PPO, circle, tmp_path, WRAPPED["normalised, stacked"])

@@ -111,6 +111,7 @@ def test_where_every_episode_ends_at_once_all_points_count(field, monkeypatch):
     assert len(running_points(field, 50, np.random.default_rng(0))) == 50
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_training_rehearses_what_its_checkpoints_lose(monkeypatch):
     spare(monkeypatch, checkpoints=4)

@@ -163,12 +163,14 @@ def vehicle_low(certificate):
     return np.array(certificate.game.task.chart.low)
 
 
+@pytest.mark.long
 def test_threads_change_nothing(certificate, loops, scores, monkeypatch):
     several = examination._replays(certificate, loops, scores)
     monkeypatch.setattr(examination, "THREADS", 1)
     assert examination._replays(certificate, loops, scores) == several
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_run_of_which_too_much_is_proved_says_so_everywhere(
     planted_circle, tmp_path, monkeypatch, capsys
@@ -219,6 +221,7 @@ class Straight:
         return np.tile(self.middle, (len(measured), 1))
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("name", ["vehicle", "unit_circle", "rover", "quadrotor", "gate", "arm"])
 def test_plain_mujoco_plays_the_same_episodes(name):
     task = hyrl_mj.get_task(name)

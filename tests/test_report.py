@@ -191,6 +191,7 @@ def data(uri, kind):
 # ---- what is in the page
 
 
+@pytest.mark.first(1)
 def test_the_page_needs_nothing_but_itself(finished):
     text = render(load_run(finished))
     page = Page(text)

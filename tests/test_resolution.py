@@ -233,6 +233,7 @@ def test_noise_is_rounded_to_whole_cells_and_never_to_none(rough):
     assert nodes_within(rough, np.array([0.0, 2.6 * y, 0.3 * heading])).tolist() == [0, 3, 1]
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_estimate_agrees_with_runs_of_the_plant(unicycle):
     loop = PolicyController(steering_policy(unicycle, gain=0.4))

@@ -333,6 +333,7 @@ def test_the_judge_s_noise_never_hides_the_chart(puck, puck_sets):
         assert noise < puck.check_noise(ground.noise.bound) <= 1.2 * noise + 1e-12
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_policy_that_parks_off_the_goal_is_not_good_enough(puck, puck_sets):
     precise = round_it(puck, 1.0)
@@ -376,6 +377,7 @@ def test_they_start_where_the_mode_may_be_picked(puck, puck_sets):
         assert puck.may_start(grid.nodes[grid.nearest(starts)]).all()
 
 
+@pytest.mark.first(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "noise"),

@@ -230,6 +230,7 @@ def test_another_agent_does_not_overwrite_a_run(circle_run):
     assert contents(circle_run.path) == before
 
 
+@pytest.mark.long
 def test_an_onnx_file_is_kept_in_the_run(circle, tmp_path):
     path = onnx_file(tmp_path, np.array([[0.0, -9.0]]), np.zeros(1))
     run = hyrl_mj.diagnose("unit_circle", path, out=tmp_path / "run", **SMOKE)
@@ -272,6 +273,7 @@ def test_what_a_policy_is_given_as_is_remembered(circle, tmp_path):
 # ---- chance, and nothing to decide
 
 
+@pytest.mark.long
 def test_episodes_stand_in_for_the_game_where_the_policy_draws(circle, tmp_path):
     path = saved(untrained(PPO, circle), tmp_path)
     said = []
@@ -288,6 +290,7 @@ def test_episodes_stand_in_for_the_game_where_the_policy_draws(circle, tmp_path)
         noisy_arcs(run, np.zeros((1, 1)), "worst")
 
 
+@pytest.mark.long
 def test_without_a_critical_set_one_policy_is_trained_under_noise(tmp_path):
     said = []
     run = hyrl_mj.robustify("unit_circle", one_way, out=tmp_path, preset="smoke", say=said.append)

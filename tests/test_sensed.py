@@ -68,6 +68,7 @@ def test_too_many_memories_are_not_played():
     assert Memory.of_sensor([(1, 0), (1, 1)], 3, 3, 20) is None
 
 
+@pytest.mark.first(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "stronger"),

@@ -146,6 +146,7 @@ parts = st.fixed_dictionaries(
 ).filter(len)
 
 
+@pytest.mark.long
 @settings(max_examples=25, deadline=None)
 @given(parts, st.sampled_from([VEHICLE, CIRCLE, "gate"]), st.integers(0, 1000))
 def test_all_parts_together_stay_within_the_bound(numbers, name, seed):
@@ -407,6 +408,7 @@ def test_a_run_is_made_for_a_bound_that_covers_the_sensor(late, capsys):
         cli.dispatch(["simulate", str(late.path), *words, "bias 0.1", "--eps", "0.1"])
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_noisy_episodes_have_the_sensor_among_their_kinds(late):
     run = hyrl_mj.load_run(late.path)

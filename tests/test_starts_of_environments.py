@@ -270,6 +270,7 @@ class Towing(Tied):
     )
 
 
+@pytest.mark.first(6)
 @pytest.mark.parametrize(
     ("make", "given", "message"),
     [
@@ -337,11 +338,13 @@ def test_a_wrapper_that_moves_the_robot_to_its_own_start_is_refused():
         from_gymnasium(lambda: Moving(At()), steps=20)
 
 
+@pytest.mark.long
 def test_a_chart_is_no_state_where_the_time_matters_late():
     kinds = Later, type("Open", (Later,), {"gate": np.inf})
     assert [from_gymnasium(kind, steps=100).chart_is_state for kind in kinds] == [False, True]
 
 
+@pytest.mark.long
 def test_one_place_may_be_noted_where_runs_begin_there_alone():
     assert from_gymnasium(FenceAtOnePlace, starts="reset", steps=5).max_steps == 5
     found = from_gymnasium(type("OnePlace", (At,), {"draws": False}), steps=5).found
@@ -403,6 +406,7 @@ class Pushed(At):
         self.data.qvel[:2] = self.np_random.uniform(-self.speed, self.speed, 2)
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     ("make", "name"),
     [
@@ -418,6 +422,7 @@ def test_rare_draws_and_those_of_the_robot_have_to_be_pinned(make, name):
         from_gymnasium(make, starts="reset", steps=20)
 
 
+@pytest.mark.long
 def test_small_noise_of_resets_is_said():
     for base, what, name in (
         (Pushed, {"speed": 0.01}, "qvel[0]"),
@@ -489,6 +494,7 @@ def shared_rewards():
     return gym.wrappers.NormalizeReward(At())
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(
     ("make", "given"),
     [

@@ -64,6 +64,7 @@ def sentences(text):
 # ---- streams
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(
     ("streams", "said"),
     [
@@ -82,6 +83,7 @@ def test_a_run_goes_on_where_its_output_cannot_be_read(folder, streams, said):
 NO_VIDEO = "replay: no video: "
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(
     ("streams", "backend", "said"),
     [

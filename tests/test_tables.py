@@ -71,6 +71,7 @@ def held(puck):
     )
 
 
+@pytest.mark.long
 def test_held_inputs_lead_where_the_environment_leads_under_them(puck, held):
     row, a = len(held.rows) // 3, 7
     plant = puck.plant(1)

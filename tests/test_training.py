@@ -67,6 +67,7 @@ def test_dqn_learns_the_vehicle_with_some_more_samples(vehicle):
     assert training.evaluate(vehicle, policy)[1] > 85
 
 
+@pytest.mark.first(1)
 @pytest.mark.slow
 def test_the_seed_fixes_every_weight_whatever_the_threads_of_the_physics(
     task, quick, tmp_path, monkeypatch

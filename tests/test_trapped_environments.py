@@ -60,6 +60,7 @@ def test_no_trap_is_wrong_in_silence(name):
     assert not tried(trapped(2 * [*TRAPS].index(name)))
 
 
+@pytest.mark.first(2)
 @pytest.mark.slow
 @pytest.mark.parametrize("pair", TWO, ids=", ".join)
 def test_two_traps_in_one_environment_are_accepted_and_right(pair):
@@ -72,6 +73,7 @@ def test_honest_environments_are_accepted_and_right(i):
     assert not tried(honest(i))
 
 
+@pytest.mark.first(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(("kinds", "plants"), [(kinds, plants) for kinds, *plants in TOGETHER])
 def test_whatever_is_honest_is_accepted_and_right_together(kinds, plants):

@@ -20,6 +20,7 @@ from hyrl_mj.tasks.motion import begins_anew, stands_still
 ROUNDS = [range(first, first + len(TRAPS)) for first in range(0, 13 * len(TRAPS), len(TRAPS))]
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:invalid value")
 @pytest.mark.parametrize(
@@ -42,6 +43,7 @@ def test_honest_robots_are_proved(tmp_path):
 # ---- each trap by itself
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("make", [vehicle, dial])
 @pytest.mark.parametrize(
     "servo",
@@ -104,6 +106,7 @@ def test_an_end_by_nan_is_not_proved(tmp_path, monkeypatch, code, bad):
     assert cells.failed[(x > 0.6) & eval(bad)].all()
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("turns", [-3, -2, 2])
 @pytest.mark.parametrize("wide", [1e-4, 1.0])
 def test_an_end_beyond_some_turns_is_told(tmp_path, monkeypatch, turns, wide):
@@ -115,6 +118,7 @@ def test_an_end_beyond_some_turns_is_told(tmp_path, monkeypatch, turns, wide):
     assert "tells whole turns of theta apart" in why
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     "code",
     [

@@ -162,6 +162,7 @@ class OnTheLastStep(gym.Wrapper):
         return observation, reward, terminated, truncated, info
 
 
+@pytest.mark.long
 def test_the_shortest_of_several_time_limits_counts_and_a_run_may_be_simulated_for_longer():
     task = from_gymnasium(lambda: TimeLimit(FlattenObservation(TimeLimit(Puck(), 12)), 60))
     assert task.max_steps == 12
@@ -199,6 +200,7 @@ def curriculum(tolerance):
 COUNTER = itertools.count()
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("where", ["a closure", "a counter of the module", "a bound method"])
 def test_a_curriculum_that_ends_before_it_is_looked_at_is_refused(where):
     episodes = [0]
@@ -243,6 +245,7 @@ def test_a_second_state_of_mujoco_is_remembered_and_may_not_outlast_resets():
     assert not task.abilities.restarts
 
 
+@pytest.mark.long
 def test_variables_of_a_script_are_not_those_of_its_environment(monkeypatch):
     script = type(sys)("a_script")
     monkeypatch.setitem(sys.modules, "a_script", script)
@@ -383,6 +386,7 @@ def test_an_entry_of_info_that_only_a_success_brings_is_taken():
 # ---- what an id, or a name, stands for
 
 
+@pytest.mark.long
 def test_of_two_functions_of_one_name_neither_is_taken_for_the_other():
     def made(scale):
         def make():
@@ -412,6 +416,7 @@ class Legs(Puck):
         return observation, reward, terminated, truncated, info
 
 
+@pytest.mark.long
 def test_options_of_a_reset_are_what_they_were_given_as_and_an_id_may_come_to_mean_another(
     monkeypatch,
 ):
@@ -452,6 +457,7 @@ class Configured(Puck):
         self.data = mujoco.MjData(self.model)
 
 
+@pytest.mark.long
 def test_settings_are_as_given_in_each_instance_and_a_file_that_changes_is_read_again(tmp_path):
     file = tmp_path / "puck.xml"
     file.write_text(XML)
@@ -491,6 +497,7 @@ class Clipping(Puck):
         return self.observe(), *result[1:]
 
 
+@pytest.mark.long
 def test_of_several_observers_the_one_that_is_called_counts():
     task = from_gymnasium(Clipping, steps=5)
     noise = np.zeros((6, 1, len(task.noisy)))
@@ -650,6 +657,7 @@ class Promoted(Puck):
         return *result, info
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -707,6 +715,7 @@ class Picky(Puck):
         return *result, {"success": info["success"] and self.data.qpos[1] * self.side > 0}
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(("make", "what"), [(Seeded, "share"), (Champion, "wins"), (Picky, "side")])
 def test_an_environment_that_is_never_replaced_is_a_judge_too(make, what):
     starts = np.random.default_rng(0).uniform((-1.8, 0.7), (1, 1.2), (30, 2))
@@ -716,6 +725,7 @@ def test_an_environment_that_is_never_replaced_is_a_judge_too(make, what):
         outcomes(lambda: FlattenObservation(make()), steps=140, starts=starts)
 
 
+@pytest.mark.long
 def test_statistics_that_are_loaded_are_kept_and_a_count_is_said():
     from_gymnasium(lambda: normalised(True))
     task = from_gymnasium(type("Counting", (Weakening,), {"weakens": False}))
@@ -757,6 +767,7 @@ def test_random_numbers_in_steps_are_noticed_whoever_draws_them(make, draw):
         from_gymnasium(kind)
 
 
+@pytest.mark.long
 def test_generators_that_nobody_draws_from_are_like_any_memory():
     makes = [make for name, (make, _) in SOURCES.items() if name != "system"]
     values = {"make": lambda self: [make(self) for make in makes], "draws": False}
@@ -832,6 +843,7 @@ class Beginning(Puck):
         return super()._get_obs() | {"to_goal": np.array([rate, 0.0])}
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     ("make", "given", "message"),
     [
@@ -922,6 +934,7 @@ class Timed(Fix):
         return super().step(action)
 
 
+@pytest.mark.long
 def test_sensors_that_measure_late_or_in_a_small_place_are_refused():
     with pytest.raises(BadInput, match=r"Fix observes does not follow its state: observation\[2\]"):
         from_gymnasium(Fix, steps=150)

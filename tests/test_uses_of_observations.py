@@ -40,6 +40,7 @@ class ByList(gym.Wrapper):
         return np.append(info["bodies"][0]["at"], observation[2:]), *rest, info
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(
     ("wrapper", "way"), [(ByObject, r"attribute robot\.place"), (ByList, r"info bodies\.0\.at")]
 )
@@ -91,6 +92,7 @@ class Judging(Flat):
         return observation, -off, terminated, truncated, info | {"success": off < 0.25}
 
 
+@pytest.mark.long
 def test_an_environment_may_judge_by_its_own_observation():
     assert outcomes(Judging, 0.1) == outcomes(Flat, 0.1)
 
@@ -128,6 +130,7 @@ def test_a_place_that_matters_late_is_found():
         from_gymnasium(Leashed)
 
 
+@pytest.mark.long
 def test_a_place_that_a_reset_notes_and_a_step_goes_by_is_refused_on_the_chart():
     with pytest.raises(BadInput, match=r"reset\(\) of Speeding notes where it leads to \(before\)"):
         from_gymnasium(Speeding)

@@ -32,6 +32,7 @@ def ahead(task, low=0.0, high=0.0, until=9.0):
     return ChartPolicy(task, rule)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(("low", "high"), [(-0.15, 0.15), (-0.05, 0.33), (-0.31, 0.08), (0.0, 0.0)])
 def test_m_star_is_in_the_middle_of_a_wedge_of_failures(low, high):
     field = Field(WIDE)
@@ -42,6 +43,7 @@ def test_m_star_is_in_the_middle_of_a_wedge_of_failures(low, high):
     assert np.diff(np.sort(x)).max() <= 1.01 * found.spacing, "a gap"
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(("width", "noise"), [(0.42, EPS), (0.22, 0.05), (0.1, 0.0)])
 def test_across_a_wider_wedge_there_is_none(width, noise):
     field = Field(WIDE)
@@ -89,6 +91,7 @@ def test_failed_nodes_take_the_way_of_the_nearest_that_arrives():
         np.testing.assert_array_equal(part.mask[wedge][sure], side * off[sure] > 0)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("eps", [0.0, 0.1])
 def test_a_part_is_wide_enough_beside_m_star_for_the_set_of_the_other_mode_to_end_there(eps):
     """The policy decides beside the post, close to where nothing is left to decide."""

@@ -270,6 +270,7 @@ def flat_puck():
     return from_gymnasium(Flat, steps=60)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("env", [Puck, Listed])
 def test_wrappers_get_what_the_environment_gives_and_may_change_it(env):
     task = from_gymnasium(lambda: Vector(env()), steps=60)
@@ -306,6 +307,7 @@ class Seldom(Home):
         return np.concatenate([fix, GOAL - self.data.qpos, self.data.qvel])
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("slow", [Late, Seldom])
 def test_sensors_that_hold_or_delay_the_place_are_refused_where_resets_are_alike(slow):
     with pytest.raises(BadInput, match=r"observation\[\d\] .*It is stored by step"):
@@ -389,6 +391,7 @@ def test_a_controller_in_a_wrapper_sees_the_noise():
 # ---- conditions
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(
     ("given", "label"),
     [
@@ -463,6 +466,7 @@ def test_mistakes_are_named(make, given, message):
         from_gymnasium(make, **given)
 
 
+@pytest.mark.long
 def test_code_that_is_imported_again_is_another_environment(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
@@ -518,6 +522,7 @@ class Far(Flat):
         return np.concatenate([self.seen(), GOAL - self.data.qpos, self.data.qvel])
 
 
+@pytest.mark.long
 def test_functions_get_the_precision_of_the_environment_and_a_reset_may_have_no_options():
     task = from_gymnasium(Far, steps=60)
     origin = np.array([652_341.0, 5_404_123.0, 0, 0, 0, 0])

@@ -82,8 +82,9 @@ def _environment() -> dict[str, str]:
     But for the current folder, whose modules it searches for none but what the user names.
     """
     folders = [f for f in sys.path if os.path.isabs(f) and f != os.getcwd()]
-    one_thread = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-    return os.environ | one_thread | {"PYTHONPATH": os.pathsep.join(folders)}
+    # Nor does it draw: MuJoCo then imports no library for it.
+    few = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MUJOCO_GL": "disable"}
+    return os.environ | few | {"PYTHONPATH": os.pathsep.join(folders)}
 
 
 def _why(run: subprocess.CompletedProcess[bytes], seconds: int, memory: int) -> str:

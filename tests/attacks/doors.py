@@ -99,7 +99,7 @@ def trials(material: Material, draw: Random, count: int) -> list[Trial]:
         "path": (folders.path, "run", 1, count),
         "threads": (folders.threads, "run", 1, 2),
         "user": (folders.user, "run", 1, count),
-        "modules": (folders.modules, "environment", 1, 8),
+        "modules": (folders.modules, "environment", 1, 4),
     }
     turns = [kind for turn in range(5) for kind in kinds if kinds[kind][2] > turn]
     made: list[Trial] = []
