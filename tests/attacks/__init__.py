@@ -83,7 +83,9 @@ class Answer:
             return f"control characters reach the terminal: {text!r}"
         if self.status not in ended:
             return f"exit status {self.status}: {(self.err or self.out).strip()[-300:]!r}"
-        if self.status == 2 and len(self.err.strip().splitlines()) != sentences:
+        # A busy machine tells first that looking at an environment takes long.
+        said = [line for line in self.err.strip().splitlines() if "to look at it" not in line]
+        if self.status == 2 and len(said) != sentences:
             return f"not {sentences} sentence(s), but {self.err.strip()[-600:]!r}"
         return ""
 
