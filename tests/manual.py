@@ -81,7 +81,7 @@ def shortened(words: list[str]) -> list[str]:
     words = list(words)
     if words[0] in TRAINING and not {"--preset", "--report"} & {*words}:
         words += ["--preset", "smoke"]
-    if words[0] == "sweep" and "--report" not in words:
+    if words[0] in ("sweep", "compare") and "--report" not in words:
         words += ["--set", *(f"{name}={value}" for name, value in TINY.items())]
     if words[0] == "replay":
         words += ["--fps", FRAMES, *(() if "--size" in words else ("--size", SIZE))]
