@@ -15,8 +15,7 @@ from hyrl_mj.policies import PolicyController
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.simulation import Signal, closed_loop, policy_runs
 from hyrl_mj.stages import ExtendedSets, PartPolicy
-from hyrl_mj.stages.grounds import mode_ground
-from hyrl_mj.stages.judges import ByAttack
+from hyrl_mj.stages.grounds import ByAttack, mode_ground
 from hyrl_mj.stages.retraining import retrain
 from hyrl_mj.stages.tables import (
     HeldInputs,
@@ -243,7 +242,7 @@ def test_a_policy_is_judged_without_noise_and_by_an_attack(puck):
     grid = Grid.with_cells(puck.chart, 24)
     sets = extended(grid, np.ones(grid.size, dtype=bool))
     ground = mode_ground(puck, sets, 0)
-    assert isinstance(ground.judge, ByAttack)
+    assert isinstance(ground, ByAttack)
     policy = SimpleNamespace(act=lambda m: np.clip(puck_agent(puck.observation(m)), -4, 4))
     idle = SimpleNamespace(act=lambda m: np.zeros((len(m), 2)))
     both = ground(policy)[0]
