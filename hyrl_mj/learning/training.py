@@ -187,9 +187,7 @@ def spread_kinks(policy: nn.Module, task: Task, seed: int) -> None:
     """
     rng = np.random.default_rng(seed)
     z = running_points(task, 4_096, rng)
-    plant = task.plant(len(z))
-    plant.set_state(*task.state(z, rng))
-    seen = torch.as_tensor(task.observation(plant.measurement))
+    seen = torch.as_tensor(task.observation(task.placed(z, rng).measurement))
     columns = len(task.observation_low)
     with torch.no_grad():
         for network in (module for module in policy.modules() if isinstance(module, nn.Sequential)):

@@ -22,7 +22,7 @@ from hyrl_mj.policies import PolicyController
 from hyrl_mj.runs.arcs import critical_start, from_middle
 from hyrl_mj.runs.directory import Run
 from hyrl_mj.simulation import HybridArc, Noise, simulate_batch
-from hyrl_mj.stages import all_part_policies
+from hyrl_mj.stages import part_policies
 
 
 def losses_of(run: Run) -> Losses | None:
@@ -30,8 +30,8 @@ def losses_of(run: Run) -> Losses | None:
     if not run.exact:
         return None
     task, policy, parts, s = run.task, run.steady, run.partition, run.settings
-    pis = all_part_policies(task, policy, parts, s.eps)
-    return sort_losses(task, policy, parts.parts, pis, s.eps, s.lattice)
+    pis = part_policies(task, policy, parts, s.eps)
+    return sort_losses(task, policy, parts.parts, [*pis.values()], s.eps, s.lattice)
 
 
 def worst_arc(run: Run, losses: Losses | None) -> HybridArc | None:

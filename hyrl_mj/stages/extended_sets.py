@@ -18,11 +18,11 @@ from hyrl_mj.sets import Grid, GridSet, check_points, distance_to
 from hyrl_mj.stages.meeting import least_room, where
 from hyrl_mj.stages.partition import (
     Partition,
+    PartPolicy,
     check_sets,
     longest_hop,
     neighbourhood,
     open_ways,
-    part_policies,
 )
 from hyrl_mj.stages.reach import backward_reach, forward_reach, runs_from_outside, shortest
 from hyrl_mj.stages.refinement import refined
@@ -154,7 +154,7 @@ def extend(
     grid, parts = partition.grid, partition.parts
     noise, hop = task.noise_in_chart(eps), longest_hop(task, policy, grid)
     near = neighbourhood(partition, eps, hop)
-    pis = part_policies(task, policy, partition, near)
+    pis = [PartPolicy(task, policy, part.eroded(near), near) for part in parts]
     # Each part with 2 eps and one sample around it.
     by = 2 * noise + hop * (task.noise_in_chart(1.0) > 0)
     wanted = [part.dilated_by_box(by) for part in parts]

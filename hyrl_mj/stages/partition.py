@@ -280,30 +280,17 @@ class PartPolicy:
             PartPolicy.KIND,
             lambda content: (float(content["near"]), bool(content.get("whole", False))),
         )
-        pi = part_policies(task, policy, partition, near)[partition.modes.index(mode)]
-        return replace(pi, whole=whole)
+        part = partition.parts[partition.modes.index(mode)]
+        return PartPolicy(task, policy, part.eroded(near), near, whole)
 
 
 def part_policies(
-    task: Task, policy: Policy, partition: Partition, near: float
-) -> tuple[PartPolicy, ...]:
-    """Returns pi_i of each mode; `near` is the width of the neighbourhood of M*."""
-    return tuple(PartPolicy(task, policy, part.eroded(near), near) for part in partition.parts)
-
-
-def part_policy(
-    task: Task, policy: Policy, partition: Partition, mode: int, eps: float
-) -> PartPolicy:
-    """Returns pi_i of a mode, with as wide a neighbourhood of M* as the noise and the steps need."""
-    return all_part_policies(task, policy, partition, eps)[partition.modes.index(mode)]
-
-
-def all_part_policies(
     task: Task, policy: Policy, partition: Partition, eps: float
-) -> tuple[PartPolicy, ...]:
-    """Returns pi_i of each mode, with as wide a neighbourhood of M* as `part_policy` takes."""
+) -> dict[int, PartPolicy]:
+    """Returns pi_i of each mode, with as wide a neighbourhood of M* as the noise and the steps need."""
     near = neighbourhood(partition, eps, longest_hop(task, policy, partition.grid))
-    return part_policies(task, policy, partition, near)
+    parts = zip(partition.modes, partition.parts, strict=True)
+    return {mode: PartPolicy(task, policy, part.eroded(near), near) for mode, part in parts}
 
 
 def neighbourhood(partition: Partition, eps: float, hop: np.ndarray) -> float:

@@ -13,8 +13,8 @@ from hyrl_mj.learning.distillation import distil, fits
 from hyrl_mj.learning.training import Score, train
 from hyrl_mj.policies import ALGORITHMS, MlpPolicy, Policy
 from hyrl_mj.stages.grounds import ModeGround
-from hyrl_mj.stages.partition import Partition, PartPolicy, part_policy
-from hyrl_mj.stages.tables import TableOf, TablePolicy
+from hyrl_mj.stages.partition import Partition, PartPolicy, part_policies
+from hyrl_mj.stages.tables import HeldInputs, TablePolicy, table_for
 
 # The policy of a mode: a trained network, pi_i, or a table.
 ModePolicy = MlpPolicy | PartPolicy | TablePolicy
@@ -40,7 +40,7 @@ def start_policy(
     task = ground.task
     if not ALGORITHMS[settings.algorithm].is_actor_critic:
         return policy if isinstance(policy, MlpPolicy) and fits(task, settings, policy) else None
-    pi = part_policy(task, policy, partition, ground.mode, ground.extended.eps)
+    pi = part_policies(task, policy, partition, ground.extended.eps)[ground.mode]
     return distil(task, pi, ground.starts, settings, seed)
 
 
@@ -52,7 +52,7 @@ def retrain(
     warm_start: WarmStart | None = None,
     others: Iterable[tuple[ModePolicy, ModeResult]] = (),
     part: PartPolicy | None = None,
-    table: TableOf | None = None,
+    held: HeldInputs | None = None,
     log_dir: Path | None = None,
 ) -> tuple[ModePolicy, ModeResult]:
     """Trains the policy of one mode (paper, Step 6).
@@ -71,7 +71,7 @@ def retrain(
             good enough for this mode.
         part: pi_i of the mode (paper, Step 4), which is used as it is if it is good enough, or else, without
             a table, the stage-1 policy itself; by default neither is tried.
-        table: returns a table of inputs for a mode; the better of it and pi_i then takes the place of the
+        held: what a table of inputs is made from; the better of it and pi_i then takes the place of the
             trainings.
         log_dir: folder of logs and checkpoints.
 
@@ -89,7 +89,7 @@ def retrain(
 
     if part is not None:
         # Without a table only trainings could follow: the agent is tried unchanged, too.
-        for untrained in (part,) if table else (part, part.undivided):
+        for untrained in (part,) if held else (part, part.undivided):
             if suffices(untrained):
                 return untrained, _result(ground, untrained, 0)
     if task.mirror is not None:
@@ -101,9 +101,9 @@ def retrain(
             if won is not None:
                 return image, ModeResult(mode, won, 0)
     trainings = 0
-    if table is not None:
-        suffices(table(mode))
-    enough = table is not None or max([score for score, _ in tried], default=()) >= ground.nearly
+    if held is not None:
+        suffices(table_for(held, mode))
+    enough = held is not None or max([score for score, _ in tried], default=()) >= ground.nearly
     for attempt in range(0 if enough else settings.attempts):
         draw = int(np.random.SeedSequence([seed, 1 + mode, attempt]).generate_state(1)[0])
         warm = None

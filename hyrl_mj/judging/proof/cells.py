@@ -274,8 +274,7 @@ def _error(lattice: Lattice, slope: np.ndarray, offset: np.ndarray) -> np.ndarra
     spread = np.zeros_like(off)
     rng, low, high = np.random.default_rng(0), *task.input_limits
     z = task.chart.draw(STATES, rng)
-    plant = task.plant(STATES)
-    plant.set_state(*task.state(z))
+    plant = task.placed(z)
     for _ in range(SAMPLES):
         drawn = rng.uniform(low, high, (STATES, len(low)))
         corners = np.where(rng.random(drawn.shape) < 0.5, low, high)
@@ -298,8 +297,7 @@ def _carried(lattice: Lattice) -> np.ndarray:
         np.tile(lattice.levels, (len(before), 1)),
     )
     start = grid.nodes[np.flatnonzero(lattice.running)[:1]]
-    plant = task.plant(len(first))
-    plant.set_state(*task.state(np.repeat(start, len(first), axis=0)))
+    plant = task.placed(np.repeat(start, len(first), axis=0))
     plant.step(first)
     middle = plant.measurement
     plant.step(then)
