@@ -271,9 +271,9 @@ def _levels(task: Task, grid: Grid) -> np.ndarray:
 def _around(
     grid: Grid, z: np.ndarray, rng: np.random.Generator | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the nodes (C, n) around points (n, d), the nearest first, and along which coordinates they differ.
+    """Returns the nodes (C, n) around points (n, d), the nearest first, and along which axes (d,) they differ.
 
-    That is (d,) bool. With a generator it is one node, C = 1, drawn so that it is right on average.
+    With a generator it is one node, C = 1, drawn so that it is right on average.
     """
     index = (grid.chart.wrap(z) - grid.chart.low) / grid.spacing
     near = np.round(index)

@@ -68,17 +68,11 @@ class Certificate:
         assert cells is not None
         rows = []
         for row in self.answers[name].possible(bound):
-            nodes, modes, ends = [], [], []
+            parts = []
             for mode, shift, reached in row:
                 node = np.flatnonzero(reached & cells.running)
-                nodes.append(node)
-                modes.append(np.full(len(node), mode))
-                ends.append(cells.after(shift)[node])
-            node = np.concatenate(nodes)
-            order = np.argsort(node, kind="stable")
-            rows.append(
-                (node[order], np.concatenate(modes)[order], np.concatenate(ends)[order][:, None])
-            )
+                parts.append((node, np.full(len(node), mode), cells.after(shift)[node]))
+            rows.append(in_order(parts))
         return Moves.gather(cells, rows)
 
     def value(self, name: str, eps: float) -> np.ndarray:
@@ -107,6 +101,13 @@ class Certificate:
         latest, latest_any = (float(x[x < NEVER].max(initial=0)) for x in (own, worst))
         dt = self.game.task.dt
         return Proved(share(own < NEVER), share(worst < NEVER), latest * dt, latest_any * dt)
+
+
+def in_order(parts: list[tuple[np.ndarray, ...]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns a row of `Moves.gather` from parts of it: nodes (k,) in any order, modes (k,), places (k,)."""
+    node, mode, ends = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    order = np.argsort(node, kind="stable")
+    return node[order], mode[order], ends[order][:, None]
 
 
 def staying(moves: Moves, places: Places, success: np.ndarray) -> np.ndarray:
