@@ -271,7 +271,7 @@ def _levels(task: Task, grid: Grid) -> np.ndarray:
 def _around(
     grid: Grid, z: np.ndarray, rng: np.random.Generator | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the nodes (C, n) around points (n, d), the nearest first, and along which axes (d,) they differ.
+    """Returns the nodes (C, n) around points (n, d), the nearest first, and along which axes they differ.
 
     With a generator it is one node, C = 1, drawn so that it is right on average.
     """

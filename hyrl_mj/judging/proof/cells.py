@@ -76,7 +76,10 @@ class Cells(Places):
         if not lattice.direct:
             raise Unbounded(f"the chart of {task.name} is not its position")
         periodic, h = np.array(task.chart.periodic), grid.spacing
-        slope, offset = _displacement(lattice)
+        # The displacement is linear in the inputs.
+        levels = np.hstack([lattice.levels, np.ones((len(lattice.levels), 1))])
+        fit, *_ = np.linalg.lstsq(levels, lattice.hops, rcond=None)
+        slope, offset = fit[:-1].T, fit[-1]
         error = _error(lattice, slope, offset)
         if (error > ALIKE * (h if spacing is None else spacing)).any():
             raise Unbounded(
@@ -238,13 +241,6 @@ class Cells(Places):
         """Returns a chart point inside of each of cells (n,): (n, d)."""
         off = rng.uniform(-0.5, 0.5, (len(cells), len(self.counts)))
         return self.middle(cells) + off * self.lattice.grid.spacing
-
-
-def _displacement(lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
-    """Returns slope (d, m) and offset (d,) of the displacement as a function of the input."""
-    levels = np.hstack([lattice.levels, np.ones((len(lattice.levels), 1))])
-    fit, *_ = np.linalg.lstsq(levels, lattice.hops, rcond=None)
-    return fit[:-1].T, fit[-1]
 
 
 def _ends(task: Task, boxes: Affine) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
