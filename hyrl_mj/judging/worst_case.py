@@ -78,8 +78,8 @@ def worst_case(
     fine = Game(task, parts, controllers, largest, everywhere, grid)
     names = [*controllers, LIMIT]
     certificate = Certificate.certify(fine, controllers)
-    scores, maps = _scores(certificate, names, controllers, bounds)
-    replays = _replays(certificate, controllers, scores)
+    scores, maps = _scores(certificate, names, bounds)
+    replays = _replays(certificate, scores)
     if not curves:
         coarse, margins = fine, dict.fromkeys(controllers)
         curve, profile = _known(bounds, scores), Profile((), dict.fromkeys(names, ()))
@@ -105,17 +105,14 @@ def worst_case(
 
 
 def _scores(
-    certificate: Certificate,
-    names: list[str],
-    controllers: Mapping[str, Controller],
-    bounds: tuple[float, ...],
+    certificate: Certificate, names: list[str], bounds: tuple[float, ...]
 ) -> tuple[dict[str, tuple[Score, ...]], Maps]:
     """Returns the scores by controller, and the maps."""
     game = certificate.game
     games = [(name, eps) for eps in bounds for name in names]
     results = list(_in_threads("worst-case scores", game.score, games))
     tried = [(name, eps) for name, eps in games if name != LIMIT]
-    asked = [(certificate, name, controllers[name], eps) for name, eps in tried]
+    asked = [(certificate, name, eps) for name, eps in tried]
     found_against = _in_threads("attacks", find_counterexamples, asked)
     broken = dict(zip(tried, found_against, strict=True))
     scores = {
@@ -125,7 +122,7 @@ def _scores(
         )
         for i, name in enumerate(names)
     }
-    classes = {name: _map(certificate, name, bounds[-1]) for name in controllers}
+    classes = {name: _map(certificate, name, bounds[-1]) for name in certificate.controllers}
     maps = Maps(bounds[-1], np.array(game.lattice.grid.counts), classes)
     return scores, maps
 
@@ -146,15 +143,10 @@ def _sensed(
 
 
 def _replays(
-    certificate: Certificate,
-    controllers: Mapping[str, Controller],
-    scores: Mapping[str, tuple[Score, ...]],
+    certificate: Certificate, scores: Mapping[str, tuple[Score, ...]]
 ) -> tuple[ReplayCount, ...]:
     """Plays in MuJoCo what the scores at the largest bound say, and returns what was lost."""
-    counts = (
-        replay(certificate, name, controller, scores[name][-1])
-        for name, controller in controllers.items()
-    )
+    counts = (replay(certificate, name, scores[name][-1]) for name in certificate.controllers)
     return tuple(count for count in counts if count)
 
 

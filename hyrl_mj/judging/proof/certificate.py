@@ -34,12 +34,14 @@ class Certificate:
 
     Attributes:
         game: the game on the nodes.
+        controllers: by name.
         cells: the cells between them.
         answers: the bounded answers of the controllers that can be bounded, by name.
         why_not: for the other controllers, what stopped it.
     """
 
     game: Game
+    controllers: Mapping[str, Controller]
     cells: Cells | None
     answers: Mapping[str, BoundedAnswers]
     why_not: Mapping[str, str]
@@ -48,19 +50,20 @@ class Certificate:
     @staticmethod
     def certify(game: Game, controllers: Mapping[str, Controller]) -> Certificate:
         """Returns the certificate of some controllers of a game."""
-        answers, why_not = {}, {}
+        answers, why_not = {}, dict[str, str]()
         if why := game.lattice.why_estimate(game.task):
-            return Certificate(game, None, {}, dict.fromkeys(controllers, why))
+            return Certificate(game, controllers, None, {}, dict.fromkeys(controllers, why))
         try:
             cells = Cells.cover(game.lattice)
         except Unbounded as error:
-            return Certificate(game, None, {}, dict.fromkeys(controllers, str(error)))
+            why_not = dict.fromkeys(controllers, str(error))
+            return Certificate(game, controllers, None, {}, why_not)
         for name, controller in controllers.items():
             try:
                 answers[name] = BoundedAnswers.enclose(cells, controller, game.bound(game.largest))
             except Unbounded as error:
                 why_not[name] = str(error)
-        return Certificate(game, cells, answers, why_not)
+        return Certificate(game, controllers, cells, answers, why_not)
 
     def moves(self, name: str, eps: float) -> Moves:
         """Returns the adversary's moves against a controller, from outside."""
