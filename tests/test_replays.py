@@ -59,7 +59,7 @@ def certificate(certified):
 
 @pytest.fixture(scope="module")
 def scores(certified, loops):
-    return examination._scores(certified, ["hyrl", "limit"], (EPS,))[0]
+    return examination._scores(certified, (EPS,))[0]
 
 
 def delayed(samples):
@@ -107,7 +107,7 @@ def test_a_proof_of_everything_is_refuted(vehicle, monkeypatch):
     everything = replace(everything, cells=cells.cells)
     places = np.zeros((3, cells.cells.places), dtype=int)
     monkeypatch.setattr(Certificate, "value", lambda self, name, eps: places)
-    score = replace(examination._scores(cells, ["hyrl"], (EPS,))[0]["hyrl"][-1], proved=1.0)
+    score = replace(examination._scores(cells, (EPS,))[0]["hyrl"][-1], proved=1.0)
     (count,) = examination._replays(everything, {"hyrl": (score,)})
     assert 0 < count.failures < count.played
     assert count.first.outcome == "crashed"
