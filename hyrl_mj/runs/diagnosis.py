@@ -50,7 +50,7 @@ def worst_arc(run: Run, losses: Losses | None) -> HybridArc | None:
         if not len(z0):
             return None
         game = Game(task, run.partition, {"policy": loop}, eps, grid=run.lattice_grid)
-        noise = worst_signal(game, "policy", loop, z0, eps)
+        noise = worst_signal(game, "policy", z0, eps)
         return _first_lost(simulate_batch(task, loop, z0, noise))
     count = 48
     if not task.abilities.arrival_ends:
