@@ -196,16 +196,16 @@ def _sweep(certificate: Certificate, points: np.ndarray) -> tuple[Curve, Profile
         rows: list[tuple[float, float, float | None]] = []
         for eps, region in zip(CURVE, regions, strict=True):
             value = values[name, eps][:, :-2]
-            own, worst = value[-1], value[:-1].max(axis=0)
+            first, worst = value[-1], value[:-1].max(axis=0)
             after = worst[region & (worst < NEVER)]
             time_any = float(after.max() * dt) if len(after) else None
-            rows.append((share(own[region] < NEVER), share(worst[region] < NEVER), time_any))
-            holds &= own[at] < NEVER
+            rows.append((share(first[region] < NEVER), share(worst[region] < NEVER), time_any))
+            holds &= first[at] < NEVER
             bears[holds] = eps
         of_cells = [proved[name, eps] for eps in CURVE if name in certificate.answers]
-        shares = (tuple(found[i] for found in of_cells) for i in range(2))
+        own, some = (tuple(found[i] for found in of_cells) for i in range(2))
         won, won_any, times = zip(*rows, strict=True)
-        wins[name] = WinningShares(won, won_any, *shares, times)
+        wins[name] = WinningShares(won, won_any, own, some, times)
         borne[name] = tuple(None if np.isnan(x) else float(x) for x in bears)
     winnable = tuple(float(region.sum() / max(game.starts.sum(), 1)) for region in regions)
     profile = Profile(tuple(tuple(point) for point in along.tolist()), borne)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -106,7 +106,7 @@ class Certificate:
         return Proved(share(own < NEVER), share(worst < NEVER), latest * dt, latest_any * dt)
 
 
-def in_order(parts: list[tuple[np.ndarray, ...]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def in_order(parts: Sequence[tuple[np.ndarray, ...]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns a row of `Moves.gather` from parts of it: nodes (k,) in any order, modes (k,), places (k,)."""
     node, mode, ends = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     order = np.argsort(node, kind="stable")
