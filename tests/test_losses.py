@@ -5,10 +5,9 @@ import pytest
 from planted import ChartPolicy, halves, pass_on, sign_policy
 
 from hyrl_mj import simulate
-from hyrl_mj.judging import sort_losses
 from hyrl_mj.judging.game import NEVER, Game
 from hyrl_mj.policies import PolicyController
-from hyrl_mj.runs.diagnosis import losses_sentence
+from hyrl_mj.runs.diagnosis import losses_sentence, sort_losses
 from hyrl_mj.sets import Grid
 from hyrl_mj.stages import part_policies
 
