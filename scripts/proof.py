@@ -51,14 +51,14 @@ def main() -> None:
     game = Game(task, run.split, {"hyrl": loop}, eps, grid=grid)
     certificate = Certificate.certify(game, {"hyrl": loop})
     assert certificate.cells is not None, certificate.why_not
-    cells, outer, inner = certificate.cells, certificate.value("hyrl", eps), game.value("hyrl", eps)
+    cells, outer = certificate.cells, certificate.value("hyrl", eps)
     shares = np.array(task.noisy, dtype=float)
     noises = {
         "uniform": Noise("uniform", eps),
         "alternating": Noise("alternating", eps),
         "bang-bang": BangBang(eps, shares),
         "worst on nodes": game.worst_noise("hyrl", eps),
-        "least certain": CellNoise(certificate, loop, outer, inner, game.bound(eps)),
+        "least certain": CellNoise(certificate, "hyrl", eps),
     }
     rng, lost, tried = np.random.default_rng(args.seed), Counter[str](), Counter[str]()
     rows = [*enumerate(loop.modes), (len(loop.modes), None)]

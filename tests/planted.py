@@ -21,7 +21,7 @@ from hyrl_mj.pipeline import steps
 from hyrl_mj.policies.hybrid import HybridController
 from hyrl_mj.runs.directory import load_run
 from hyrl_mj.sets import Chart, Grid, GridSet
-from hyrl_mj.stages import judges
+from hyrl_mj.stages import grounds
 from hyrl_mj.stages.critical_set import CriticalSet
 from hyrl_mj.stages.partition import Partition
 from hyrl_mj.tasks import Learning, Outcome, Scene, Task
@@ -90,7 +90,7 @@ def spare_environments(patch):
     """Patches how many runs judge controllers in environments, of which each takes tenths of a second."""
     few = {"batches": 1, "nodes": 6, "episodes": 24}
     patch.setattr(EnvironmentTask, "effort", replace(EnvironmentTask.effort, **few))
-    patch.setattr(judges, "ATTACKED", 12)
+    patch.setattr(grounds, "ATTACKED", 12)
 
 
 def few_trials(patch):

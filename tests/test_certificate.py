@@ -84,9 +84,9 @@ def test_no_noise_beats_what_is_proved(certified):
     game, loops, certificate = certified
     rng, cells, n = np.random.default_rng(0), certificate.cells, 1_000
     for name, loop in loops.items():
-        outer, inner = certificate.value(name, EPS), game.value(name, EPS)
+        outer = certificate.value(name, EPS)
         noises = [Noise("uniform", EPS), Noise("alternating", EPS), game.worst_noise(name, EPS)]
-        noises.append(CellNoise(certificate, loop, outer, inner, game.bound(EPS)))
+        noises.append(CellNoise(certificate, name, EPS))
         for row, mode in enumerate((*loop.modes, None)):
             proved = np.flatnonzero((outer[row, :-2] < NEVER) & cells.running)
             assert len(proved) > 0.2 * cells.nodes
@@ -122,7 +122,7 @@ def test_the_gap_closes_as_the_cells_become_smaller(vehicle):
         )
         certificate = Certificate.certify(game, loops)
         own, some, time, _ = certificate.wins("hyrl", EPS)
-        broken = find_counterexamples(certificate, "hyrl", loops["hyrl"], EPS)
+        broken = find_counterexamples(certificate, "hyrl", EPS)
         region = certificate.region(EPS)
         gaps.append((~broken.own[region]).mean() - own)
         assert some <= own
@@ -164,7 +164,7 @@ def test_the_time_to_arrival_is_bounded(certified):
 def test_starts_that_count_as_broken_are_lost_on_the_plant(certified):
     game, loops, certificate = certified
     for name, loop in loops.items():
-        broken = find_counterexamples(certificate, name, loop, EPS)
+        broken = find_counterexamples(certificate, name, EPS)
         region = certificate.region(EPS)
         proved = certificate.value(name, EPS)[:, :-2] < NEVER
         assert not (broken.own & proved[-1] & region).any()
@@ -186,7 +186,7 @@ def test_noise_between_the_nodes_beats_what_the_game_calls_won(vehicle):
     game = Game(vehicle, halves(vehicle), loops, EPS, grid=Grid.with_cells(vehicle.chart, 120))
     certificate = Certificate.certify(game, loops)
     broken, region = (
-        find_counterexamples(certificate, "hyrl", loops["hyrl"], EPS),
+        find_counterexamples(certificate, "hyrl", EPS),
         certificate.region(EPS),
     )
     nodes = game.score("hyrl", EPS)
@@ -202,9 +202,9 @@ def test_what_cannot_be_bounded_is_attacked_all_the_same(vehicle):
         "policy": "a policy that is a ChartPolicy cannot be bounded",
         "hyrl": "a AnalyticSet cannot be bounded: give sets on grids",
     }
-    assert find_counterexamples(certificate, "policy", loops["policy"], EPS).own.any()
-    none = Certificate(game, None, {}, {})
-    nodes = find_counterexamples(none, "policy", loops["policy"], EPS)
+    assert find_counterexamples(certificate, "policy", EPS).own.any()
+    none = Certificate(game, loops, None, {}, {})
+    nodes = find_counterexamples(none, "policy", EPS)
     assert nodes.own.shape == (game.lattice.nodes,)
     assert nodes.own.any()
     assert (none.region(EPS) == (game.starts & game.winnable(EPS))).all()
@@ -247,10 +247,7 @@ def test_where_runs_never_end_what_is_proved_stays_at_the_set_point(circle):
     cells, value = certificate.cells, certificate.value("policy", 0.05)[-1, :-2]
     at = np.flatnonzero(value < NEVER)[::7]
     settings = LoopSettings(quiet=True, steps=400)
-    noise = CellNoise(
-        certificate, loops["policy"], certificate.value("policy", 0.05), game.value("policy", 0.05),
-        game.bound(0.05),
-    )  # fmt: skip
+    noise = CellNoise(certificate, "policy", 0.05)
     run = closed_loop(circle, loops["policy"], cells.middle(at), noise, settings=settings)
     assert (circle.miss(run.path[-1]) <= circle.close).all(), "long after the end of an episode"
     # More noise than the set-point is wide can lead any run away from it again.

@@ -327,7 +327,7 @@ def test_the_worst_signal_crashes_lost_starts_in_the_sample_foreseen(
     game, controllers = on_vehicle
     value = game.value(name, eps)[-1 if q0 is None else q0, :-2]
     at, z0 = some(game.lattice.grid.nodes, game.starts & (value > NEVER))
-    signal = worst_signal(game, name, controllers[name], z0, eps, q0)
+    signal = worst_signal(game, name, z0, eps, q0)
     assert np.abs(signal.values).max(initial=0.0) <= eps + 1e-12
     assert not signal.values[..., 0].any(), "x is measured without noise"
     arcs = simulate(vehicle, controllers[name], z0, noise=signal, q0=q0)
@@ -457,7 +457,7 @@ def test_the_worst_signal_keeps_trapped_starts_from_arriving(circle, on_circle):
     eps = 12 * game.lattice.grid.cell
     at = np.flatnonzero(own(game, "sign", eps) == NEVER)
     z0 = game.lattice.grid.nodes[at]
-    signal = worst_signal(game, "sign", controllers["sign"], z0, eps)
+    signal = worst_signal(game, "sign", z0, eps)
     assert len(signal.values) == circle.max_steps
     assert np.abs(signal.values).max() <= eps + 1e-9
     arcs = simulate(circle, controllers["sign"], z0, noise=signal)

@@ -5,20 +5,19 @@ import pytest
 from planted import ChartPolicy, halves, pass_on, sign_policy
 
 from hyrl_mj import simulate
-from hyrl_mj.judging import sort_losses
 from hyrl_mj.judging.game import NEVER, Game
 from hyrl_mj.policies import PolicyController
-from hyrl_mj.runs.diagnosis import losses_sentence
+from hyrl_mj.runs.diagnosis import losses_sentence, sort_losses
 from hyrl_mj.sets import Grid
-from hyrl_mj.stages import all_part_policies
+from hyrl_mj.stages import part_policies
 
 EPS, CELLS = 0.1, 120
 
 
 def sorted_losses(task, policy, eps):
     parts = halves(task)
-    pis = all_part_policies(task, policy, parts, eps)
-    return sort_losses(task, policy, parts.parts, pis, eps, CELLS)
+    pis = part_policies(task, policy, parts, eps)
+    return sort_losses(task, policy, parts.parts, [*pis.values()], eps, CELLS)
 
 
 def lost_by(task, policy):

@@ -6,7 +6,7 @@ from planted import ChartPolicy, circle_policy, one_way_policy, sign_policy
 
 from hyrl_mj import Partition, find_critical_set, make_partition
 from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.stages.partition import PartPolicy, part_policies
+from hyrl_mj.stages.partition import PartPolicy
 
 PI = np.pi
 
@@ -23,6 +23,11 @@ def vehicle_parts(vehicle):
     policy = sign_policy(vehicle)
     points = find_critical_set(vehicle, policy, 60, 1 / 32).points
     return make_partition(vehicle, policy, points, 60)
+
+
+def part_policies(task, policy, partition, near):
+    """pi_i of each mode, with a neighbourhood of M* of some width."""
+    return [PartPolicy(task, policy, part.eroded(near), near) for part in partition.parts]
 
 
 def inside(part, *z):

@@ -59,7 +59,7 @@ def certificate(certified):
 
 @pytest.fixture(scope="module")
 def scores(certified, loops):
-    return examination._scores(certified, ["hyrl", "limit"], loops, (EPS,))[0]
+    return examination._scores(certified, (EPS,))[0]
 
 
 def delayed(samples):
@@ -77,7 +77,7 @@ def delayed(samples):
 
 def test_an_honest_plant_keeps_what_is_proved(certificate, loops, scores):
     assert scores["hyrl"][-1].proved > 0.99
-    (count,) = examination._replays(certificate, loops, scores)
+    (count,) = examination._replays(certificate, scores)
     assert (count.controller, count.of, count.eps, count.first) == ("hyrl", "proved", EPS, None)
     assert count.starts == {kind: n for kind, n in FEW.items() if kind != "sensor"}
     assert (count.failures, count.judged, count.is_whole) == (0, 440 // 20, True)
@@ -85,7 +85,7 @@ def test_an_honest_plant_keeps_what_is_proved(certificate, loops, scores):
 
 def test_a_plant_that_lags_behind_what_was_proved_of_it_loses_the_word(certificate, loops, scores):
     certificate.game.task = delayed(3)  # what was proved is true of another plant
-    (count,) = examination._replays(certificate, loops, scores)
+    (count,) = examination._replays(certificate, scores)
     assert 0 < count.lost["none"] <= count.failures < count.played
     assert count.judged >= count.failures
     first, task = count.first, certificate.game.task
@@ -107,8 +107,8 @@ def test_a_proof_of_everything_is_refuted(vehicle, monkeypatch):
     everything = replace(everything, cells=cells.cells)
     places = np.zeros((3, cells.cells.places), dtype=int)
     monkeypatch.setattr(Certificate, "value", lambda self, name, eps: places)
-    score = replace(examination._scores(cells, ["hyrl"], grid, (EPS,))[0]["hyrl"][-1], proved=1.0)
-    (count,) = examination._replays(everything, lost, {"hyrl": (score,)})
+    score = replace(examination._scores(cells, (EPS,))[0]["hyrl"][-1], proved=1.0)
+    (count,) = examination._replays(everything, {"hyrl": (score,)})
     assert 0 < count.failures < count.played
     assert count.first.outcome == "crashed"
 
@@ -125,12 +125,12 @@ def test_starts_that_are_won_are_replayed_where_nothing_is_proved(vehicle):
 
 def test_an_estimate_is_not_replayed(certificate, loops, scores, monkeypatch):
     monkeypatch.setattr(type(certificate.game.lattice), "estimate", True)
-    assert examination._replays(certificate, loops, scores) == ()
+    assert examination._replays(certificate, scores) == ()
 
 
 def test_starts_lie_in_what_is_proved_in_every_mode_and_at_its_border(certificate, loops, scores):
     assert scores["hyrl"][-1].proved > 0.99
-    batches = replays.batches_of(certificate, "hyrl", loops["hyrl"], EPS, "proved")
+    batches = replays.batches_of(certificate, "hyrl", EPS, "proved")
     z0, q0 = (np.concatenate([getattr(b, name) for b in batches]) for name in ("z0", "q0"))
     assert set(q0) == {-1, 0, 1}
     cells, spacing = certificate.cells, certificate.game.lattice.grid.spacing
@@ -165,9 +165,9 @@ def vehicle_low(certificate):
 
 @pytest.mark.long
 def test_threads_change_nothing(certificate, loops, scores, monkeypatch):
-    several = examination._replays(certificate, loops, scores)
+    several = examination._replays(certificate, scores)
     monkeypatch.setattr(examination, "THREADS", 1)
-    assert examination._replays(certificate, loops, scores) == several
+    assert examination._replays(certificate, scores) == several
 
 
 @pytest.mark.long

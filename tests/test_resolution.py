@@ -32,8 +32,7 @@ from hyrl_mj.runs.directory import Run
 from hyrl_mj.sets import Chart, Grid, GridSet
 from hyrl_mj.simulation import LoopSettings, closed_loop
 from hyrl_mj.stages import ExtendedSets
-from hyrl_mj.stages.grounds import mode_ground
-from hyrl_mj.stages.judges import ByEpisodes, ByGame
+from hyrl_mj.stages.grounds import ByEpisodes, ByGame, mode_ground
 from hyrl_mj.tasks import Effort, Learning, Outcome
 from hyrl_mj.viz.section import Section
 
@@ -124,9 +123,9 @@ def test_stage_6_asks_episodes_where_two_inputs_do_not_fit(monkeypatch):
     grid = Grid.with_cells(plane.chart, 120)
     part = GridSet.from_mask(grid, np.ones(len(grid.nodes), dtype=bool))
     sets = ExtendedSets((0,), (part,), (part.mask,), 0.1, 0.1, np.empty((0, 2)), np.empty(0))
-    assert type(mode_ground(plane, sets, 0).judge) is ByGame
+    assert type(mode_ground(plane, sets, 0)) is ByGame
     monkeypatch.setattr(lattice_module, "MOST_TRANSITIONS", 1_000)
-    assert type(mode_ground(plane, sets, 0).judge) is ByEpisodes
+    assert type(mode_ground(plane, sets, 0)) is ByEpisodes
 
 
 # ---- an inner loop on velocity actuators

@@ -18,8 +18,7 @@ from hyrl_mj.policies.hybrid import HybridController
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.simulation import KINDS
 from hyrl_mj.stages.extended_sets import ExtendedSets, extend
-from hyrl_mj.stages.grounds import mode_ground
-from hyrl_mj.stages.judges import Attacked, ByEpisodes, ByGame, Episodes, Judged
+from hyrl_mj.stages.grounds import ByEpisodes, ByGame, Episodes, Judged, mode_ground
 from hyrl_mj.stages.retraining import retrain
 
 # ---- where modes are trained
@@ -180,7 +179,7 @@ def test_where_runs_end_is_judged_as_they_are_simulated(vehicle, left):
     late = one_way_policy(vehicle, 1.0, clear=1.11)
     swerving = ChartPolicy(vehicle, lambda z: np.where(z[:, :1] > 2.96, late.rule(z), wide.rule(z)))
     for policy in (wide, one_way_policy(vehicle, 1.0, clear=1.06), swerving):
-        starts = left.states.grid.nodes[left.states.early]
+        starts = left.grid.nodes[left.early]
         ends = closed_loop(vehicle, PolicyController(policy), starts).path[-1]
         miss = -left(policy)[1] * vehicle.precision
         assert miss == pytest.approx(vehicle.miss(ends).max(), abs=1e-6)
@@ -200,7 +199,7 @@ def test_a_few_states_at_which_the_mode_is_never_selected_may_be_lost(
     vehicle, left, monkeypatch, wide, few, suffices
 ):
     """About x = 0.2 m it goes the wrong way; y >= -0.1 m are selected."""
-    monkeypatch.setattr(left.judge, "settings", ModeSettings(few=few))
+    monkeypatch.setattr(left, "settings", ModeSettings(few=few))
     right = one_way_policy(vehicle, 1.0, clear=1.0)
 
     def rule(z):
@@ -208,8 +207,8 @@ def test_a_few_states_at_which_the_mode_is_never_selected_may_be_lost(
 
     policy = ChartPolicy(vehicle, rule)
     assert left(policy) < left.enough
-    assert (left.states.grid.nodes[lost_by(left), 1].max() < -0.1) == (wide == 0.02)
-    assert 1e-4 < len(lost_by(left)) / len(left.states.nodes) < 0.05
+    assert (left.grid.nodes[lost_by(left), 1].max() < -0.1) == (wide == 0.02)
+    assert 1e-4 < len(lost_by(left)) / len(left.nodes) < 0.05
     assert left.suffices(policy) == suffices
 
 
@@ -217,9 +216,9 @@ def test_training_goes_on_where_the_game_is_lost(vehicle, left):
     left(one_way_policy(vehicle, 1.0, clear=0.8))
     rng = np.random.default_rng(0)
     z = left.starts(4000, rng)
-    lost = np.isin(left.states.grid.nearest(z), lost_by(left))
+    lost = np.isin(left.grid.nearest(z), lost_by(left))
     left(one_way_policy(vehicle, 1.0, clear=1.0))
-    elsewhere = np.isin(left.states.grid.nearest(left.starts(4000, rng)), left.states.nodes)
+    elsewhere = np.isin(left.grid.nearest(left.starts(4000, rng)), left.nodes)
     assert lost.mean() > 0.15
     assert elsewhere.all()
 
@@ -273,7 +272,7 @@ def by_episodes(puck, sets, mode, policy=None, **changes):
     ground = mode_ground(
         puck, sets, mode, policy=policy, settings=ModeSettings(**{"batches": FEW, **changes})
     )
-    assert isinstance(ground.judge, ByEpisodes)
+    assert isinstance(ground, ByEpisodes)
     return ground
 
 
@@ -319,7 +318,7 @@ def test_a_policy_that_just_survives_the_noise_is_not_good_enough(puck, puck_set
 def test_a_policy_that_survives_all_episodes_is_attacked(puck, puck_sets):
     ground = by_episodes(puck, puck_sets, 0, batches=MORE, margin=1.0)
     closer = round_it(puck, 1.0, clear=0.685)
-    assert ground(closer) == (len(ground.judge.plays), -1 / 64), "one start of 64 is lost"
+    assert ground(closer) == (len(ground.plays), -1 / 64), "one start of 64 is lost"
     assert not ground.suffices(closer)
     assert len(lost_by(ground)) == 1
     assert ground.won(closer) == 1 - 1 / 64
@@ -339,7 +338,7 @@ def test_a_policy_that_parks_off_the_goal_is_not_good_enough(puck, puck_sets):
     precise = round_it(puck, 1.0)
     ground = by_episodes(puck, puck_sets, 0, policy=precise)
     # It goes the same way, and then to a place beside the set-point that counts as arrived.
-    off = ground.judge.allowed + 0.05
+    off = ground.allowed + 0.05
     assert off < puck.close
     parking = ChartPolicy(
         puck,
@@ -350,16 +349,16 @@ def test_a_policy_that_parks_off_the_goal_is_not_good_enough(puck, puck_sets):
     assert ground.won(parking) == 1.0
     assert score < ground.enough <= ground(precise)
     assert ground.won(precise) == 1.0
-    assert -score[1] * ground.judge.allowed == pytest.approx(off, abs=0.06)
+    assert -score[1] * ground.allowed == pytest.approx(off, abs=0.06)
 
 
 @pytest.mark.slow
 def test_a_task_may_say_how_far_off_is_good_enough(puck, puck_sets, monkeypatch):
     precise = round_it(puck, 1.0)
-    usual = by_episodes(puck, puck_sets, 0, policy=precise).judge.allowed
+    usual = by_episodes(puck, puck_sets, 0, policy=precise).allowed
     for precision, expected in ((3 * usual, 3 * usual), (1e-3, usual)):
         monkeypatch.setattr(puck, "precision", precision)
-        allowed = by_episodes(puck, puck_sets, 0, policy=precise).judge.allowed
+        allowed = by_episodes(puck, puck_sets, 0, policy=precise).allowed
         assert allowed <= expected + 1e-12
         assert (allowed > usual) == (precision > usual)
     assert allowed > 1e-3, "as far off as the stage-1 policy is allowed in any case"
@@ -369,11 +368,11 @@ def test_a_task_may_say_how_far_off_is_good_enough(puck, puck_sets, monkeypatch)
 def test_they_start_where_the_mode_may_be_picked(puck, puck_sets):
     for mode, side in ((0, 1.0), (1, -1.0)):
         ground = by_episodes(puck, puck_sets, mode)
-        cell = ground.states.grid.cell
-        y = side * ground.judge.episodes.starts[:, 1]
+        cell = ground.grid.cell
+        y = side * ground.begins[:, 1]
         assert -0.1 - 2 * cell <= y.min() < 0.0
         assert y.max() > 0.6
-        grid, starts = ground.states.grid, ground.judge.episodes.starts
+        grid, starts = ground.grid, ground.begins
         assert puck.may_start(grid.nodes[grid.nearest(starts)]).all()
 
 
@@ -389,7 +388,7 @@ def test_modes_are_trained_and_judged_under_what_the_sensor_does(puck, puck_sets
     sets = replace(puck_sets, eps=bound)
     ground = by_episodes(task, sets, 0)
     assert ground.noise.kind == noise
-    assert {kind for _, kind in ground.judge.plays} == {*KINDS, "sensor"}
+    assert {kind for _, kind in ground.plays} == {*KINDS, "sensor"}
     settings = replace(preset(task, "smoke").stage6, samples=4_096, attempts=1)
     policy, result = retrain(ground, settings, seed=0)
     assert result.attempts == 1
@@ -417,14 +416,14 @@ def test_the_image_of_a_policy_that_wins_all_is_judged_by_fewer_episodes(
         played.append((batch, kind))
         return np.ones(FEW[batch], dtype=bool), np.zeros(FEW[batch])
 
-    def lost(attacked, policy):
+    def lost(ground, policy):
         played.append("attack")
-        return np.zeros(len(attacked.starts), dtype=bool)
+        return np.zeros(len(ground.attacked), dtype=bool)
 
     monkeypatch.setattr(Episodes, "play", play)
-    monkeypatch.setattr(Attacked, "lost", lost)
+    monkeypatch.setattr(ByEpisodes, "lost_under_attack", lost)
     assert ground.won_by_image(object(), won) == 1.0
-    assert played == [*ground.judge.plays[:plays], *["attack"] * attacks]
+    assert played == [*ground.plays[:plays], *["attack"] * attacks]
 
 
 @pytest.mark.slow
@@ -441,9 +440,9 @@ def test_they_start_where_all_nodes_around_can_be_won(puck, puck_sets):
         puck_sets.winning[1],
     )
     ground = by_episodes(puck, replace(puck_sets, winning=winning), 0)
-    nodes, spacing = ground.states.grid.nodes, ground.states.grid.spacing
-    assert len(ground.judge.episodes.starts) == sum(FEW)
-    for z in ground.judge.episodes.starts:
+    nodes, spacing = ground.grid.nodes, ground.grid.spacing
+    assert len(ground.begins) == sum(FEW)
+    for z in ground.begins:
         around = (np.abs(nodes - z) < spacing - 1e-9).all(axis=1)
         assert around.any()
-        assert ground.states.wanted[around].all()
+        assert ground.wanted[around].all()

@@ -32,8 +32,7 @@ from hyrl_mj.policies.external import read_agent, reopen_agent
 from hyrl_mj.runs.arcs import noisy_arcs
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages import Partition, boundary, with_room
-from hyrl_mj.stages.grounds import mode_ground
-from hyrl_mj.stages.judges import ByGame, Judged
+from hyrl_mj.stages.grounds import ByGame, Judged, mode_ground
 from hyrl_mj.stages.retraining import retrain, start_policy
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("small_runs")]  # whole runs on agents
@@ -317,7 +316,7 @@ def test_a_function_is_distilled_part_by_part(circle_run, ground):
     found = start_of(circle_run, circle_run.policy, ground)
     assert found.algorithm == "ppo"
     # Mode 0 goes on clockwise beyond the decision at 2.5.
-    assert ground.states.within.contains(np.array([[2.6]])).all()
+    assert ground.within.contains(np.array([[2.6]])).all()
     assert (found.act(np.linspace(0.5, 2.65, 50)[:, None]) < 0).all()
 
 

@@ -227,11 +227,11 @@ def test_the_map_s_classes_are_those_of_the_starts(vehicle, on_vehicle):
 
 
 def test_the_worst_signal_of_several_starts_is_that_of_each_alone(vehicle, on_vehicle):
-    game, controllers = on_vehicle
+    game, _ = on_vehicle
     z0 = np.array([[0.0, 0.05], [0.3, -0.05], [0.4, 0.0]])
-    together = worst_signal(game, "sign", controllers["sign"], z0, 0.1)
+    together = worst_signal(game, "sign", z0, 0.1)
     for i in range(len(z0)):
-        alone = worst_signal(game, "sign", controllers["sign"], z0[i : i + 1], 0.1)
+        alone = worst_signal(game, "sign", z0[i : i + 1], 0.1)
         np.testing.assert_array_equal(together.values[: len(alone.values), i], alone.values[:, 0])
         assert not together.values[len(alone.values) :, i].any(), "none after the end"
 
@@ -240,7 +240,7 @@ def test_a_start_between_the_nodes_is_led_into_the_pillar_too(vehicle, on_vehicl
     game, controllers = on_vehicle
     x = np.random.default_rng(0).uniform(0.0, 0.4, 50)
     z0 = np.stack([x, np.full_like(x, 0.025)], axis=-1)
-    signal = worst_signal(game, "sign", controllers["sign"], z0, 0.1)
+    signal = worst_signal(game, "sign", z0, 0.1)
     assert np.abs(signal.values).max() <= 0.1 + 1e-12
     assert {arc.outcome for arc in simulate(vehicle, controllers["sign"], z0)} == {"reached"}
     arcs = simulate(vehicle, controllers["sign"], z0, noise=signal)
@@ -255,7 +255,7 @@ def test_no_milder_noise_crashes_what_the_worst_does_not(vehicle, on_vehicle):
     signals = [
         Noise("alternating", 0.1),
         Noise("adversarial", 0.1),
-        worst_signal(game, "sign", controllers["sign"], z0, 0.1),
+        worst_signal(game, "sign", z0, 0.1),
     ]
     *milder, worst = (
         [arc.outcome == "crashed" for arc in simulate(vehicle, controllers["sign"], z0, noise=s)]

@@ -290,7 +290,7 @@ def test_a_phase_that_passes_pi_is_not_wrapped_either(circle):
     controllers = {"policy": PolicyController(policy)}
     grid = Grid.with_cells(phase.chart, 300)
     game = Game(phase, halves(circle), controllers, 0.3, grid=grid)
-    signal = worst_signal(game, "policy", controllers["policy"], np.array([[3.0]]), 0.3)
+    signal = worst_signal(game, "policy", np.array([[3.0]]), 0.3)
     assert np.abs(signal.values).max() <= 0.3 + 1e-9
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from hyrl_mj.alternatives.base import Alternative, Candidate, Given, Unfit, register
 from hyrl_mj.policies import HybridController, PolicyController
 from hyrl_mj.sets import GridSet
-from hyrl_mj.stages import ExtendedSets, HeldInputs, Partition, part_policy, table_for
+from hyrl_mj.stages import ExtendedSets, HeldInputs, Partition, part_policies, table_for
 
 
 @register
@@ -25,9 +25,7 @@ class HysteresisAlone(Alternative):
         if len(run.extended_sets.modes) < 2:
             raise Unfit("the run has one mode, so that nothing is switched")
         own = run.controller
-        policies = {
-            q: part_policy(task, run.steady, run.partition, q, given.eps) for q in own.modes
-        }
+        policies = part_policies(task, run.steady, run.partition, given.eps)
         yield Candidate(
             "stages 1 to 5", HybridController(task, policies, own.flow_sets, own.starts)
         )

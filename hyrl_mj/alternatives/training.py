@@ -6,16 +6,15 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any
 
-import numpy as np
 from stable_baselines3 import PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv
 
 from hyrl_mj.alternatives.base import Given
 from hyrl_mj.gym_export import BatchedEnv
 from hyrl_mj.gym_export.sb3_env import TaskVecEnv
-from hyrl_mj.learning.training import ACTIVATIONS, spread_kinks, threads
+from hyrl_mj.learning.training import spread_kinks, threads, with_settings
 from hyrl_mj.policies import Controller
 from hyrl_mj.simulation import AnyNoise
 
@@ -61,27 +60,9 @@ def learned(
         of_policy: arguments of the policy to change.
     """
     settings, best = given.training("ppo"), _Best(given, controller)
-    rate = settings.learning_rate
-    activation = ACTIVATIONS[settings.activation]
-    if settings.normalize:
-        env = VecNormalize(env, norm_obs=False, clip_reward=np.inf, gamma=settings.gamma)
+    arguments = {**settings.options, **options}
     with threads(1):  # faster for small networks
-        model: Any = algorithm(
-            policy,
-            env,
-            seed=given.seed,
-            device="cpu",
-            gamma=settings.gamma,
-            learning_rate=(lambda left: rate * max(left, settings.final_rate))
-            if settings.anneal
-            else rate,
-            policy_kwargs={
-                "net_arch": list(settings.hidden),
-                "activation_fn": activation,
-                **of_policy,
-            },
-            **settings.options | dict(options),
-        )
+        model = with_settings(algorithm, policy, env, settings, given.seed, of_policy, arguments)
         if settings.spread and start is None:
             spread_kinks(model.policy, given.task, given.seed)
         if start is not None:

@@ -6,7 +6,6 @@ from hyrl_mj.fields.controller import (
     controllers,
     exported_controller,
     for_posts,
-    is_local,
 )
 from hyrl_mj.fields.drives import (
     DriveOptions,
@@ -39,7 +38,6 @@ __all__ = [
     "ending",
     "exported_controller",
     "for_posts",
-    "is_local",
     "least_clearance",
     "noise_cautions",
     "read_field",

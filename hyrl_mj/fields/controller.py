@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any
 
 import numpy as np
 
@@ -259,11 +259,6 @@ def controllers(
 # ---- what any task gives to those who do not know of fields
 
 
-def is_local(task: Task) -> TypeGuard[Field]:
-    """Returns whether policies that are trained on a task can drive through fields of posts."""
-    return isinstance(task, Field)
-
-
 def acting_policy(task: Task, policy: Policy, mode: int, eps: float) -> Policy:
     """Returns what acts in a mode under noise of a bound, from the policy that was trained for the mode.
 
@@ -272,7 +267,7 @@ def acting_policy(task: Task, policy: Policy, mode: int, eps: float) -> Policy:
     Raises:
         BadInput: the guard needs a network, which the policy is not.
     """
-    if not is_local(task):
+    if not isinstance(task, Field):
         return policy
     if not isinstance(policy, MlpPolicy):
         raise BadInput(
@@ -295,7 +290,7 @@ def exported_controller(
         BadInput: the file is none of a field, or the task has no use for one.
     """
     task = controller.task
-    if is_local(task):
+    if isinstance(task, Field):
         sides: dict[int, Any] = {**controller.policies}  # with guards
         eps = next(iter(sides.values())).eps
         posts = 1 if field is None else read_field(field).layouts.posts

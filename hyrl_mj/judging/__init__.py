@@ -8,7 +8,6 @@ from hyrl_mj.judging.attacks import Attack, Budget, attack, attack_starts
 from hyrl_mj.judging.episodes import NoisyEpisodes, Regions, noisy_episodes
 from hyrl_mj.judging.evidence import VerdictSettings, by_kind
 from hyrl_mj.judging.examination import USUAL, Examination, ExamineOptions, Subject, examine
-from hyrl_mj.judging.losses import Losses, sort_losses
 from hyrl_mj.judging.results import Arrivals, Kind, ModeResult, Retraining
 from hyrl_mj.judging.sentences import POLICIES, listed, margin_text, mode_sentence, replays_sentence
 from hyrl_mj.judging.verdict import Verdict, Word
@@ -22,7 +21,6 @@ __all__ = [
     "Examination",
     "ExamineOptions",
     "Kind",
-    "Losses",
     "ModeResult",
     "NoisyEpisodes",
     "Regions",
@@ -42,5 +40,4 @@ __all__ = [
     "noisy_episodes",
     "proof",
     "replays_sentence",
-    "sort_losses",
 ]

@@ -69,6 +69,7 @@ class Search:
         length: the length of a run without noise [samples], the median over the starts.
         unaided: (n,) bool, the starts that are lost without noise.
         open: (n,) bool, the other starts that nothing has broken yet.
+        danger: (n,) the greatest danger from each start so far.
         signals: (K, n, p) the strongest signal for each start so far.
         samples: number of samples that were simulated.
         tried: for each kind of rule, in how many runs it was held throughout; and in how many there were
@@ -91,7 +92,7 @@ class Search:
         self._label, n = "attack, without noise", len(starts)
         self.open, self.segment = np.ones(n, dtype=bool), task.max_steps
         self.signals = np.zeros((task.max_steps, n, len(shares)))
-        self._worst = np.full(n, -np.inf)
+        self.danger = np.full(n, -np.inf)
         self._winners = np.full((n, segments), self.rules.nothing)
         self._values = np.full((n, GOALS, settings.elites), -np.inf)
         self._elites = np.full((*self._values.shape, segments), self.rules.nothing)
@@ -101,11 +102,6 @@ class Search:
         self.quiet, _ = self._simulate(np.arange(n), self._elites[:, 0, 0])
         self.unaided = ~self.open
         self.length = max(int(np.median(self.quiet.time) / task.dt), 1)
-
-    @property
-    def most_dangerous(self) -> int:
-        """The index of the start of the greatest danger so far."""
-        return int(np.argmax(self._worst))
 
     def prepare(self, length: int) -> None:
         """Prepares the rounds, for runs of a length [samples], which is the same for all controllers."""
@@ -185,7 +181,7 @@ class Search:
         from scipy.stats import rankdata
 
         s = self.settings
-        focused = rows[np.argsort(-self._worst[rows], kind="stable")[: s.focused]]
+        focused = rows[np.argsort(-self.danger[rows], kind="stable")[: s.focused]]
         for row in focused:
             if row not in self._evolved:
                 own = np.random.default_rng([self.seed, 1, row])
@@ -236,8 +232,8 @@ class Search:
                 self._known[row].add(programme.tobytes())
             if not self.open[row]:
                 continue
-            if lost[i] or signal.danger[i] > self._worst[row]:
-                self._worst[row] = signal.danger[i]
+            if lost[i] or signal.danger[i] > self.danger[row]:
+                self.danger[row] = signal.danger[i]
                 self.signals[: len(noise), row], self.signals[len(noise) :, row] = noise[:, i], 0.0
             if lost[i]:
                 self.open[row], self._winners[row] = False, programme

@@ -242,8 +242,9 @@ def attack(
         # Replays may be longer than an episode, in which alone the attack acts.
         signal = Recorded(search.signals, bound, Programmes.kind, "none", shares)
         arcs = simulate_batch(task, controllers[name], starts, signal)
+        dangerous = int(np.argmax(search.danger))
         found[name] = Attack.from_arcs(
-            arcs, signal, search.quiet, search.most_dangerous, controller=name, everywhere=everywhere,
+            arcs, signal, search.quiet, dangerous, controller=name, everywhere=everywhere,
             rounds=rounds, seconds=budget.seconds, samples=search.samples, tried=dict(search.tried),
         )  # fmt: skip
     return found

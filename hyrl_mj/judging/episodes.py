@@ -157,10 +157,10 @@ def noisy_episodes(
             for n, batch in zip(sizes.values(), ended):  # noqa: B905 - the next pair goes on
                 played.append(batch)
                 progress.update(n)
-            counts += _count(noise, name, played)
-            ends.setdefault((noise.kind, noise.bound), {})[name] = _joined(
-                [batch.ends for batch in played]
-            )
+            of_ends, outcome, inside = zip(*played, strict=True)
+            counts += _count(noise, name, np.concatenate(outcome), inside)
+            whole = map(np.concatenate, zip(*map(astuple, of_ends), strict=True))
+            ends.setdefault((noise.kind, noise.bound), {})[name] = Ends(*whole)
     quiet = next((own for (kind, _), own in ends.items() if kind == NO_NOISE), None)
     noisy = [(kind, own) for (kind, _), own in ends.items() if kind != NO_NOISE]
     comparisons = [compare(kind, quiet, own) for kind, own in noisy] if quiet else []
@@ -173,15 +173,6 @@ def ends_of(task: Task, run: Rollout) -> Ends:
     return Ends(run.outcome != Outcome.REACHED, run.length * task.dt, way)
 
 
-@dataclass(frozen=True)
-class _Played:
-    """How the episodes of a batch end, the outcome (n,) of each, and which lie in each region, (n,) bool."""
-
-    ends: Ends
-    outcome: np.ndarray
-    regions: dict[str, np.ndarray]
-
-
 def _play(
     plants: Mapping[int, Plant],
     task: Task,
@@ -189,10 +180,13 @@ def _play(
     near: float,
     seed: int,
     batch: tuple[Controller, NamedNoise, int, int, int],
-) -> _Played:
+) -> tuple[Ends, np.ndarray, dict[str, np.ndarray]]:
     """Plays episodes at once: the next n after the `first` of one controller and noise.
 
     What lies near M* is told by the bound `near`; `judged` of them are played once more by plain MuJoCo.
+
+    Returns:
+        How they end, the outcome (n,) of each, and which lie in each region, (n,) bool by its name.
     """
     controller, noise, first, n, judged = batch
     seeds = np.random.SeedSequence([seed, first]).generate_state(2)
@@ -208,19 +202,15 @@ def _play(
         else:  # every loss of an environment is played again
             rows = lost_first[: max(judged, int((runs.outcome != Outcome.REACHED).sum()))]
             task.verify(z0, runs, rows)
-    return _Played(ends_of(task, runs), runs.outcome, regions.split(task, near, z0))
+    return ends_of(task, runs), runs.outcome, regions.split(task, near, z0)
 
 
-def _joined(parts: Sequence[Ends]) -> Ends:
-    """Returns the ends of several batches as one."""
-    return Ends(*(np.concatenate(arrays) for arrays in zip(*map(astuple, parts), strict=True)))
-
-
-def _count(noise: NamedNoise, name: str, batches: Sequence[_Played]) -> Iterator[EpisodeCount]:
-    """Yields how the episodes of each region ended."""
-    outcome = np.concatenate([batch.outcome for batch in batches])
-    for region in batches[0].regions:
-        inside = np.concatenate([batch.regions[region] for batch in batches])
+def _count(
+    noise: NamedNoise, name: str, outcome: np.ndarray, regions: Sequence[dict[str, np.ndarray]]
+) -> Iterator[EpisodeCount]:
+    """Yields how the episodes of each region ended, from outcomes (n,) and the regions of each batch."""
+    for region in regions[0]:
+        inside = np.concatenate([batch[region] for batch in regions])
         numbers = np.bincount(outcome[inside], minlength=len(Outcome))
         reached, total = int(numbers[Outcome.REACHED]), int(numbers.sum())
         if total:

@@ -71,40 +71,24 @@ class Sample:
         return max(self.least, if_all_won, 4 * self.total if self.total >= self.least else 0)
 
 
-@dataclass(frozen=True)
-class SuccessRates:
-    """What a controller is not known to lose: shares of the winnable starts, or of the episodes.
+def success_rates(robustness: Robustness, who: str) -> tuple[float | None, float | None]:
+    """Returns what "policy" or "hyrl" is not known to lose, without noise and under noise.
 
-    Attributes:
-        quiet: without noise, None if that was not examined.
-        noisy: under noise, None if that was not examined.
+    These are shares of the winnable starts, or of the episodes; None of what was not examined.
     """
-
-    quiet: float | None
-    noisy: float | None
-
-    @staticmethod
-    def count(robustness: Robustness, who: str) -> SuccessRates:
-        """Returns what "policy" or "hyrl" wins."""
-        attacked = [
-            1 - c.lost / c.attacked
-            for c in robustness.attacks
-            if c.controller == who and c.attacked
-        ]
-        if robustness.deciding:
-            scores = robustness.deciding.scores[who]
-            replays = robustness.deciding.replays_of(who)
-            replayed = replays.shares if replays else (1.0, 1.0)
-            quiet = [min(score.not_broken, replayed[0]) for score in scores if score.eps == 0]
-            noisy = min(scores[-1].not_broken, replayed[1], *attacked, 1.0)
-            return SuccessRates(quiet[0] if quiet else None, noisy)
-        shares = {
-            kind: arrived / episodes
-            for kind, (arrived, episodes) in by_kind(robustness, who).items()
-        }
-        quiet_share = shares.pop(NO_NOISE, None)
-        under_noise = [*shares.values(), *attacked]
-        return SuccessRates(quiet_share, min(under_noise) if under_noise else None)
+    attacked = [
+        1 - c.lost / c.attacked for c in robustness.attacks if c.controller == who and c.attacked
+    ]
+    if robustness.deciding:
+        scores = robustness.deciding.scores[who]
+        replays = robustness.deciding.replays_of(who)
+        replayed = replays.shares if replays else (1.0, 1.0)
+        quiet = [min(score.not_broken, replayed[0]) for score in scores if score.eps == 0]
+        noisy = min(scores[-1].not_broken, replayed[1], *attacked, 1.0)
+        return quiet[0] if quiet else None, noisy
+    shares = {kind: won / total for kind, (won, total) in by_kind(robustness, who).items()}
+    quiet_share = shares.pop(NO_NOISE, None)
+    return quiet_share, min([*shares.values(), *attacked], default=None)
 
 
 def by_kind(robustness: Robustness, who: str) -> dict[str, tuple[int, int]]:

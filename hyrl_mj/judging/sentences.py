@@ -11,6 +11,9 @@ from hyrl_mj.judging.game import NO_NOISE, Comparison, ReplayCount, Score, perce
 from hyrl_mj.judging.results import ModeResult
 from hyrl_mj.tasks import Task
 
+# What sentences call the controllers.
+NAMES = {"policy": "the policy", "hyrl": "HyRL"}
+
 
 def comparison_sentence(task: Task, compared: Comparison) -> str:
     """Returns what one kind of noise does to both controllers from the same starts."""
@@ -28,7 +31,7 @@ def comparison_sentence(task: Task, compared: Comparison) -> str:
 
 def replays_sentence(task: Task, count: ReplayCount) -> str:
     """Returns how many replays a controller lost, and the first of them."""
-    who = "the policy" if count.controller == "policy" else "HyRL"
+    who = NAMES[count.controller]
     said = "proved" if count.of == "proved" else "winnable"
     if count.first is None:
         return (

@@ -6,10 +6,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 
-from hyrl_mj.judging.evidence import Sample, SuccessRates, VerdictSettings, by_kind
+from hyrl_mj.judging.evidence import Sample, VerdictSettings, by_kind, success_rates
 from hyrl_mj.judging.game import NEARLY, NO_NOISE, ReplayCount, Robustness, percent
 from hyrl_mj.judging.results import Arrivals, Retraining
 from hyrl_mj.judging.sentences import (
+    NAMES,
     POLICIES,
     comparison_sentence,
     listed,
@@ -130,14 +131,6 @@ class _Case:
     settings: VerdictSettings
 
     @property
-    def policy(self) -> SuccessRates:
-        return SuccessRates.count(self.robustness, "policy")
-
-    @property
-    def hyrl(self) -> SuccessRates:
-        return SuccessRates.count(self.robustness, "hyrl")
-
-    @property
     def noise(self) -> str:
         """The noise of the examination, in words."""
         eps, everywhere = self.robustness.eps, self.robustness.everywhere
@@ -163,7 +156,10 @@ class _Case:
     @property
     def examined(self) -> bool:
         """Whether the examination was under as much noise as the run's bound."""
-        return self.robustness.eps >= self.bound and self.hyrl.noisy is not None
+        return (
+            self.robustness.eps >= self.bound
+            and success_rates(self.robustness, "hyrl")[1] is not None
+        )
 
     @property
     def winnable(self) -> float:
@@ -223,7 +219,7 @@ class _Case:
 
     def won(self) -> Iterator[str]:
         """Yields why the run is WON or HELD, if the game is to be believed."""
-        won = self.hyrl.noisy
+        _, won = success_rates(self.robustness, "hyrl")
         if not self.examined or not self.winnable or won is None:
             return
         if self.robustness.deciding and won == 1 and self.fair:
@@ -284,7 +280,7 @@ class _Case:
         """Yields what makes a run a failure, whatever else it does."""
         if not self.winnable:
             yield f"no start is winnable under {self.noise}"
-        policy, hyrl = self.policy.quiet, self.hyrl.quiet
+        policy, hyrl = (success_rates(self.robustness, who)[0] for who in NAMES)
         if policy is not None and hyrl is not None and hyrl < policy:
             yield (
                 f"without noise HyRL loses {percent(1 - hyrl)} of {self.lost_of}, more than the policy "
@@ -308,7 +304,7 @@ class _Case:
         """Yields why the run is WEAK, if it is."""
         if self.arrivals.arrived < NEARLY * self.arrivals.episodes:
             yield f"the policy {self.arrivals}"
-        policy, hyrl = self.policy.noisy, self.hyrl.noisy
+        policy, hyrl = (success_rates(self.robustness, who)[1] for who in NAMES)
         if policy is not None and hyrl is not None and policy < hyrl < 1 and self.better:
             whole = self.lost_of
             if self.robustness.attacks:
@@ -359,7 +355,7 @@ class _Case:
                 "can be won"
             )
         assert self.robustness.deciding
-        policy, hyrl = (self.robustness.deciding.scores[who] for who in ("policy", "hyrl"))
+        policy, hyrl = (self.robustness.deciding.scores[who] for who in NAMES)
         for ours, theirs in zip(hyrl, policy, strict=True):
             if ours.eps in (0, self.robustness.eps):
                 when = f"under the worst {self.noise}" if ours.eps else "without noise"
@@ -367,9 +363,10 @@ class _Case:
                     f"{when} HyRL {share_sentence(ours)} of {self.whole}, the policy {share_sentence(theirs)}"
                 )
         if sensed := self.robustness.deciding.sensed:
-            names = {"hyrl": "HyRL", "policy": "the policy"}
             each = [
-                f"{names[who]} from {percent(sensed[who].proved)}" for who in names if who in sensed
+                f"{NAMES[who]} from {percent(sensed[who].proved)}"
+                for who in ("hyrl", "policy")
+                if who in sensed
             ]
             yield (
                 "the sensor can do less than all noise within that bound: under the sensor itself are proved "
@@ -388,7 +385,7 @@ class _Case:
             yield f"{when} HyRL arrives in {arrived:,} of {episodes:,} episodes, the policy in {theirs:,}"
         yield from self._attacked("hyrl", "policy")
         if game := self.robustness.game:
-            policy_lost, lost = (1 - game.scores[who][-1].not_broken for who in ("policy", "hyrl"))
+            policy_lost, lost = (1 - game.scores[who][-1].not_broken for who in NAMES)
             yield (
                 f"the worst-case game on nodes, here an estimate, finds noise that beats HyRL from "
                 f"{percent(lost)} of the starts that were tried, and the policy from "
@@ -397,8 +394,7 @@ class _Case:
 
     def _attacked(self, *controllers: str) -> Iterator[str]:
         """Yields in one sentence from how many starts the attack, if any, breaks these controllers."""
-        names = {"hyrl": "HyRL", "policy": "the policy"}
         found = {c.controller: c for c in self.robustness.attacks}
-        breaks = [f"{names[who]} from {found[who].broken}" for who in controllers if who in found]
+        breaks = [f"{NAMES[who]} from {found[who].broken}" for who in controllers if who in found]
         if breaks:
             yield f"the attack breaks {', '.join(breaks)}"

@@ -1,7 +1,8 @@
 """Controllers in the worst case: what is proved, what is lost, margins, curve and maps."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -76,21 +77,20 @@ def worst_case(
     curves = curves and exact  # a coarser lattice would estimate nothing
     largest = max(*bounds, LARGEST) if curves else max(bounds)
     fine = Game(task, parts, controllers, largest, everywhere, grid)
-    names = [*controllers, LIMIT]
     certificate = Certificate.certify(fine, controllers)
-    scores, maps = _scores(certificate, names, controllers, bounds)
-    replays = _replays(certificate, controllers, scores)
+    scores, maps = _scores(certificate, bounds)
+    replays = _replays(certificate, scores)
     if not curves:
         coarse, margins = fine, dict.fromkeys(controllers)
-        curve, profile = _known(bounds, scores), Profile((), dict.fromkeys(names, ()))
+        curve, profile = _known(bounds, scores), Profile((), dict.fromkeys(scores, ()))
         sensed = {}
     else:
         coarse = Game(task, parts, controllers, largest, everywhere, curve_grid(task, cells))
         of_coarse = Certificate.certify(coarse, controllers)
-        curve, profile = _sweep(of_coarse, names, points)
+        curve, profile = _sweep(of_coarse, points)
         sensed = _sensed(task, bounds[-1], (certificate, of_coarse))
         likely = [(name, _last_won(curve, curve.wins[name])) for name in controllers]
-        margins = dict(zip(controllers, _in_threads("margins", fine.margin, likely), strict=True))
+        margins = {name: x for (name, _), x in _in_threads("margins", fine.margin, likely).items()}
     spacing, curve_spacing = (tuple(g.lattice.grid.spacing.tolist()) for g in (fine, coarse))
     lattice = LatticeSpacing(
         spacing, fine.lattice.exact, certificate.cells is not None, curve_spacing
@@ -105,27 +105,21 @@ def worst_case(
 
 
 def _scores(
-    certificate: Certificate,
-    names: list[str],
-    controllers: Mapping[str, Controller],
-    bounds: tuple[float, ...],
+    certificate: Certificate, bounds: tuple[float, ...]
 ) -> tuple[dict[str, tuple[Score, ...]], Maps]:
     """Returns the scores by controller, and the maps."""
-    game = certificate.game
+    game, names = certificate.game, [*certificate.controllers, LIMIT]
     games = [(name, eps) for eps in bounds for name in names]
-    results = list(_in_threads("worst-case scores", game.score, games))
+    nodes = _in_threads("worst-case scores", game.score, games)
     tried = [(name, eps) for name, eps in games if name != LIMIT]
-    asked = [(certificate, name, controllers[name], eps) for name, eps in tried]
-    found_against = _in_threads("attacks", find_counterexamples, asked)
-    broken = dict(zip(tried, found_against, strict=True))
+    broken = _in_threads("attacks", partial(find_counterexamples, certificate), tried)
     scores = {
         name: tuple(
-            _score(certificate, name, found, broken.get((name, found.eps)))
-            for found in results[i :: len(names)]
+            _score(certificate, name, nodes[name, eps], broken.get((name, eps))) for eps in bounds
         )
-        for i, name in enumerate(names)
+        for name in names
     }
-    classes = {name: _map(certificate, name, bounds[-1]) for name in controllers}
+    classes = {name: _map(certificate, name, bounds[-1]) for name in certificate.controllers}
     maps = Maps(bounds[-1], np.array(game.lattice.grid.counts), classes)
     return scores, maps
 
@@ -146,15 +140,10 @@ def _sensed(
 
 
 def _replays(
-    certificate: Certificate,
-    controllers: Mapping[str, Controller],
-    scores: Mapping[str, tuple[Score, ...]],
+    certificate: Certificate, scores: Mapping[str, tuple[Score, ...]]
 ) -> tuple[ReplayCount, ...]:
     """Plays in MuJoCo what the scores at the largest bound say, and returns what was lost."""
-    counts = (
-        replay(certificate, name, controller, scores[name][-1])
-        for name, controller in controllers.items()
-    )
+    counts = (replay(certificate, name, scores[name][-1]) for name in certificate.controllers)
     return tuple(count for count in counts if count)
 
 
@@ -190,45 +179,37 @@ def _map(certificate: Certificate, name: str, eps: float) -> np.ndarray:
     return classes
 
 
-def _sweep(certificate: Certificate, names: list[str], points: np.ndarray) -> tuple[Curve, Profile]:
+def _sweep(certificate: Certificate, points: np.ndarray) -> tuple[Curve, Profile]:
     """Returns the curve over `CURVE`, and the profile of the noise that points (N, d) of M* bear."""
-    game = certificate.game
+    game, names = certificate.game, [*certificate.controllers, LIMIT]
     task, dt = game.task, game.task.dt
     along = points[task.may_start(points)]
     at = game.lattice.grid.nearest(along)
-    winnable: list[float] = []
-    rows: dict[str, list[tuple[float, float, float | None]]] = {name: [] for name in names}
-    holds = {name: np.ones(len(along), dtype=bool) for name in names}
-    borne = {name: np.full(len(along), np.nan) for name in names}
     games = [(name, eps) for eps in CURVE for name in names]
     values = _in_threads("worst-case curve", game.value, games)
-    for eps in CURVE:
-        region = game.starts & game.winnable(eps)
-        winnable.append(float(region.sum() / max(game.starts.sum(), 1)))
-        for name in names:
-            value = next(values)[:, :-2]
-            own, worst = value[-1], value[:-1].max(axis=0)
-            won = worst[region & (worst < NEVER)]
-            time_any = float(won.max() * dt) if len(won) else None
-            rows[name].append((share(own[region] < NEVER), share(worst[region] < NEVER), time_any))
-            holds[name] &= own[at] < NEVER
-            borne[name][holds[name]] = eps
-    profile = Profile(
-        points=tuple(tuple(point) for point in along.tolist()),
-        eps={k: tuple(None if np.isnan(x) else float(x) for x in v) for k, v in borne.items()},
-    )
+    regions = [game.starts & game.winnable(eps) for eps in CURVE]
     proofs = [(name, eps) for name in certificate.answers for eps in CURVE]
-    found = list(_in_threads("proofs", certificate.wins, proofs))
-    proved = {
-        name: found[i * len(CURVE) : (i + 1) * len(CURVE)]
-        for i, name in enumerate(certificate.answers)
-    }
-    wins = {}
-    for name, row in rows.items():
-        own, some, *_ = zip(*proved[name], strict=True) if name in proved else ((), ())
-        won, won_any, times = zip(*row, strict=True)
+    proved = _in_threads("proofs", certificate.wins, proofs)
+    wins, borne = {}, {}
+    for name in names:
+        holds, bears = np.ones(len(along), dtype=bool), np.full(len(along), np.nan)
+        rows: list[tuple[float, float, float | None]] = []
+        for eps, region in zip(CURVE, regions, strict=True):
+            value = values[name, eps][:, :-2]
+            first, worst = value[-1], value[:-1].max(axis=0)
+            after = worst[region & (worst < NEVER)]
+            time_any = float(after.max() * dt) if len(after) else None
+            rows.append((share(first[region] < NEVER), share(worst[region] < NEVER), time_any))
+            holds &= first[at] < NEVER
+            bears[holds] = eps
+        of_cells = [proved[name, eps] for eps in CURVE if name in certificate.answers]
+        own, some = (tuple(found[i] for found in of_cells) for i in range(2))
+        won, won_any, times = zip(*rows, strict=True)
         wins[name] = WinningShares(won, won_any, own, some, times)
-    return Curve(CURVE, tuple(winnable), wins), profile
+        borne[name] = tuple(None if np.isnan(x) else float(x) for x in bears)
+    winnable = tuple(float(region.sum() / max(game.starts.sum(), 1)) for region in regions)
+    profile = Profile(tuple(tuple(point) for point in along.tolist()), borne)
+    return Curve(CURVE, winnable, wins), profile
 
 
 def _known(bounds: tuple[float, ...], scores: Mapping[str, tuple[Score, ...]]) -> Curve:
@@ -273,10 +254,11 @@ def _misses(game: Game, controllers: Mapping[str, Controller]) -> dict[str, floa
 
 def _in_threads(
     label: str, work: Callable[..., Any], calls: Sequence[tuple[Any, ...]]
-) -> Iterator[Any]:
-    """Yields the results of calls in their order, from threads: NumPy releases the interpreter's lock."""
+) -> dict[tuple[Any, ...], Any]:
+    """Returns what calls give by their arguments, from threads: NumPy releases the interpreter's lock."""
     threads = min(THREADS, cores.count())
     # One limit for all threads: those within would undo each other's.
     with BLAS.limit(limits=1, user_api="blas"), ThreadPoolExecutor(threads) as pool:
         results = pool.map(lambda call: work(*call), calls)
-        yield from progress_bar(results, label, "games", len(calls))
+        found = progress_bar(results, label, "games", len(calls))
+        return dict(zip(calls, found, strict=True))

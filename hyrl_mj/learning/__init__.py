@@ -5,11 +5,12 @@ The modules `training`, `distillation` and `symmetry` import torch: import them 
 
 from hyrl_mj.learning.changes import STAGES, changed, changes, differing, setting_value
 from hyrl_mj.learning.presets import preset
-from hyrl_mj.learning.settings import Settings, Training
-from hyrl_mj.learning.stage_settings import (
+from hyrl_mj.learning.settings import (
     ModeSettings,
     OverlapSettings,
+    Settings,
     TableSettings,
+    Training,
     WaySettings,
 )
 

@@ -40,9 +40,7 @@ def distil(task: Task, policy: Policy, starts: Starts, settings: Training, seed:
     """
     model = build(task, settings, seed)
     rng = np.random.default_rng(seed)
-    plant = task.plant(STATES)
-    plant.set_state(*task.state(starts(STATES, rng), rng))
-    measured = plant.measurement
+    measured = task.placed(starts(STATES, rng), rng).measurement
     observations = torch.as_tensor(task.observation(measured).astype(np.float32))
     inputs, levels = policy.act(measured), task.input_levels
     if levels is None:

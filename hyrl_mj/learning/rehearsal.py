@@ -69,7 +69,5 @@ class Rehearsal:
 def running_points(task: Task, n: int, rng: np.random.Generator) -> np.ndarray:
     """Returns those of n drawn chart points (k, d) at which no episode ends at once; all n if all end."""
     z = task.chart.draw(n, rng)
-    plant = task.plant(n)
-    plant.set_state(*task.state(z, rng))
-    running = task.ending(plant.measurement) == Outcome.RUNNING
+    running = task.ending(task.placed(z, rng).measurement) == Outcome.RUNNING
     return z[running] if running.any() else z

@@ -1,9 +1,9 @@
 """Training of policies with SB3 on the batched environments (paper, Steps 1 and 6)."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -124,33 +124,19 @@ def build(
             differ.
     """
     algorithms.check(settings.algorithm, task.name, task.learning.levels)
-    hidden = settings.hidden if start_from is None else start_from.hidden
-    activation = settings.activation if start_from is None else start_from.activation
-    rate = settings.learning_rate
     core = BatchedEnv(task, settings.envs, noise=noise, domain=domain, max_steps=settings.episode)
-    env: VecEnv = TaskVecEnv(core)
-    if settings.normalize:
-        env = VecNormalize(env, norm_obs=False, clip_reward=np.inf, gamma=settings.gamma)
     options = dict(settings.options)
     if settings.action_noise:
         m = len(task.inputs)
         options["action_noise"] = NormalActionNoise(np.zeros(m), np.full(m, settings.action_noise))
-    kind = algorithms.sb3_class(settings.algorithm)
+    kind, of_policy = algorithms.sb3_class(settings.algorithm), {}
+    if start_from is not None:
+        of_policy = network(start_from.hidden, start_from.activation)
     try:
         # One thread orthogonalises the initial weights with other sums than two or more, which agree.
         with threads(2):
-            model = kind(
-                "MlpPolicy",
-                env,
-                seed=seed,
-                device="cpu",
-                gamma=settings.gamma,
-                learning_rate=(lambda left: rate * max(left, settings.final_rate))
-                if settings.anneal
-                else rate,
-                policy_kwargs={"net_arch": list(hidden), "activation_fn": ACTIVATIONS[activation]},
-                **options,
-            )
+            env = TaskVecEnv(core)
+            model = with_settings(kind, "MlpPolicy", env, settings, seed, of_policy, options)
     except HyrlError:
         raise
     except Exception as error:  # whatever SB3, torch and foreign classes raise
@@ -174,6 +160,46 @@ def build(
     return model
 
 
+def network(hidden: Sequence[int], activation: str) -> dict[str, Any]:
+    """Returns the arguments of a policy of SB3 for a network of widths `hidden`."""
+    return {"net_arch": [*hidden], "activation_fn": ACTIVATIONS[activation]}
+
+
+def with_settings(
+    algorithm: Callable[..., Any],
+    policy: Any,
+    env: VecEnv,
+    settings: Training,
+    seed: int,
+    of_policy: Mapping[str, Any],
+    options: Mapping[str, Any],
+) -> Any:
+    """Returns an algorithm of SB3 with the settings of a training.
+
+    Args:
+        algorithm, policy: SB3's classes, of the policy also the name.
+        env: the episodes.
+        settings: rewards, discount and learning rate are as they say.
+        seed: seed of weights and exploration.
+        of_policy: arguments of the policy; by default the network is as the settings say.
+        options: arguments of the algorithm.
+    """
+    rate, gamma = settings.learning_rate, settings.gamma
+    if settings.normalize:
+        env = VecNormalize(env, norm_obs=False, clip_reward=np.inf, gamma=gamma)
+    falling = settings.anneal
+    return algorithm(
+        policy,
+        env,
+        seed=seed,
+        device="cpu",
+        gamma=gamma,
+        learning_rate=(lambda left: rate * max(left, settings.final_rate)) if falling else rate,
+        policy_kwargs=network(settings.hidden, settings.activation) | dict(of_policy),
+        **options,
+    )
+
+
 def spread_kinks(policy: nn.Module, task: Task, seed: int) -> None:
     """Moves the kink of every unit that reads the observation to an observation of the chart.
 
@@ -187,9 +213,7 @@ def spread_kinks(policy: nn.Module, task: Task, seed: int) -> None:
     """
     rng = np.random.default_rng(seed)
     z = running_points(task, 4_096, rng)
-    plant = task.plant(len(z))
-    plant.set_state(*task.state(z, rng))
-    seen = torch.as_tensor(task.observation(plant.measurement))
+    seen = torch.as_tensor(task.observation(task.placed(z, rng).measurement))
     columns = len(task.observation_low)
     with torch.no_grad():
         for network in (module for module in policy.modules() if isinstance(module, nn.Sequential)):

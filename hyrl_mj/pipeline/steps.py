@@ -37,8 +37,7 @@ from hyrl_mj.stages import (
     extend,
     find_critical_set,
     make_partition,
-    part_policy,
-    table_for,
+    part_policies,
     with_room,
 )
 from hyrl_mj.system import cores
@@ -147,7 +146,7 @@ def _retrained(
 
     part = None
     if task.effort.attacked:
-        part = part_policy(task, policy, partition, mode, sets.eps)
+        part = part_policies(task, policy, partition, sets.eps)[mode]
     table, s = held is not None, settings
     return retrain(
         mode_ground(task, sets, mode, split, policy, table, s.modes, s.attack),
@@ -156,7 +155,7 @@ def _retrained(
         warm_start=partial(start_policy, policy, partition),
         others=others,
         part=part,
-        table=None if held is None else partial(table_for, held),
+        held=held,
         log_dir=logs / f"mode_{mode}",
     )
 

@@ -105,7 +105,7 @@ def noisy_arcs(
             elif game is None:
                 signal = Noise(noise, bound)
             else:
-                signal = worst_signal(game, name, loop, z0, bound, q0, steps)
+                signal = worst_signal(game, name, z0, bound, q0, steps)
             key = name if q0 is None else f"{name}_q{q0}"
             arcs[key] = simulate_batch(task, loop, z0, signal, q0, horizon, seed)
     return arcs

@@ -2,27 +2,87 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.judging import (
     Budget,
-    Losses,
     Regions,
     attack,
     attack_starts,
     margin_text,
     replays_sentence,
-    sort_losses,
 )
-from hyrl_mj.judging.game import NO_NOISE, Game, Robustness, percent, worst_signal
-from hyrl_mj.policies import PolicyController
+from hyrl_mj.judging.game import (
+    NEVER,
+    NO_NOISE,
+    Game,
+    Robustness,
+    curve_grid,
+    percent,
+    worst_signal,
+)
+from hyrl_mj.policies import Policy, PolicyController
 from hyrl_mj.runs.arcs import critical_start, from_middle
 from hyrl_mj.runs.directory import Run
+from hyrl_mj.sets import GridSet, within_reach
 from hyrl_mj.simulation import HybridArc, Noise, simulate_batch
-from hyrl_mj.stages import all_part_policies
+from hyrl_mj.stages import part_policies
+from hyrl_mj.tasks import Task
+
+
+@dataclass(frozen=True)
+class Losses:
+    """The winnable starts that a policy loses in the worst-case game, by what would cure it.
+
+    Attributes:
+        unaided: (n, d) starts that are lost without noise, too. The others are won without noise.
+        undecided: (n, d) starts that are won if the policy holds the way of its first measurement: noise
+            makes it change its mind at M*. Hysteresis cures that.
+        grazing: (n, d) starts that are lost all the same: on its way the policy comes so close to where it
+            fails that noise does the rest. Training under noise cures that.
+    """
+
+    unaided: np.ndarray
+    undecided: np.ndarray
+    grazing: np.ndarray
+
+
+def sort_losses(
+    task: Task,
+    policy: Policy,
+    parts: Sequence[GridSet],
+    pis: Sequence[Policy],
+    eps: float,
+    cells: int,
+) -> Losses:
+    """Sorts the winnable starts that a policy loses to the worst noise.
+
+    Each part's policy pi_i (paper, Step 4) plays the game alone. A start is won by holding the way if all
+    pi_i win that the first measurement can select.
+
+    Args:
+        task: the robot and its problem.
+        policy: the policy, a function of the measurement.
+        parts: M_i of each mode.
+        pis: pi_i of each mode.
+        eps: the noise bound.
+        cells: lattice cells along the longest side, as in `curve_grid`.
+    """
+    loops = {f"part {i}": PolicyController(pi) for i, pi in enumerate(pis)}
+    grid = curve_grid(task, cells)
+    game = Game(task, parts, {"policy": PolicyController(policy), **loops}, eps, grid=grid)
+    lost = game.starts & game.winnable(eps) & (game.value("policy", eps)[-1, :-2] >= NEVER)
+    held = np.ones(len(lost), dtype=bool)
+    window = np.ceil(game.bound(eps) / grid.spacing).astype(int)
+    for name, side in zip(loops, game.limit.sides, strict=True):
+        selected = within_reach(side.reshape(grid.counts), window, task.chart.periodic).ravel()
+        held &= ~selected | (game.value(name, eps)[-1, :-2] < NEVER)
+    nodes, alone = grid.nodes, game.value("policy", 0.0)[-1, :-2] >= NEVER
+    return Losses(nodes[lost & alone], nodes[lost & ~alone & held], nodes[lost & ~alone & ~held])
 
 
 def losses_of(run: Run) -> Losses | None:
@@ -30,8 +90,8 @@ def losses_of(run: Run) -> Losses | None:
     if not run.exact:
         return None
     task, policy, parts, s = run.task, run.steady, run.partition, run.settings
-    pis = all_part_policies(task, policy, parts, s.eps)
-    return sort_losses(task, policy, parts.parts, pis, s.eps, s.lattice)
+    pis = part_policies(task, policy, parts, s.eps)
+    return sort_losses(task, policy, parts.parts, [*pis.values()], s.eps, s.lattice)
 
 
 def worst_arc(run: Run, losses: Losses | None) -> HybridArc | None:
@@ -50,7 +110,7 @@ def worst_arc(run: Run, losses: Losses | None) -> HybridArc | None:
         if not len(z0):
             return None
         game = Game(task, run.partition, {"policy": loop}, eps, grid=run.lattice_grid)
-        noise = worst_signal(game, "policy", loop, z0, eps)
+        noise = worst_signal(game, "policy", z0, eps)
         return _first_lost(simulate_batch(task, loop, z0, noise))
     count = 48
     if not task.abilities.arrival_ends:

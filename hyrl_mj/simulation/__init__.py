@@ -23,7 +23,7 @@ from hyrl_mj.simulation.noise import (
     try_signal,
 )
 from hyrl_mj.simulation.noise_of_logs import LogNoise, NamedNoise, noise_from_log, noise_of
-from hyrl_mj.simulation.passing import Passing, windings
+from hyrl_mj.simulation.passing import Passing, Rows, windings
 from hyrl_mj.simulation.programmes import GIVEN, Programmes
 from hyrl_mj.simulation.real import judge, judge_task
 from hyrl_mj.simulation.rollout import LoopSettings, Rollout, closed_loop
@@ -51,6 +51,7 @@ __all__ = [
     "Programmes",
     "Recorded",
     "Rollout",
+    "Rows",
     "Rules",
     "Sample",
     "Sensor",

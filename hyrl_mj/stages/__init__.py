@@ -10,10 +10,9 @@ from hyrl_mj.stages.extended_sets import ExtendedSets, extend
 from hyrl_mj.stages.partition import (
     Partition,
     PartPolicy,
-    all_part_policies,
     boundary,
     make_partition,
-    part_policy,
+    part_policies,
     with_room,
 )
 from hyrl_mj.stages.tables import HeldInputs, TablePolicy, table_for
@@ -25,14 +24,13 @@ __all__ = [
     "PartPolicy",
     "Partition",
     "TablePolicy",
-    "all_part_policies",
     "boundary",
     "critical_points",
     "extend",
     "find_critical_set",
     "grounds",
     "make_partition",
-    "part_policy",
+    "part_policies",
     "retraining",
     "table_for",
     "with_room",

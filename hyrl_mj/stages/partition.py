@@ -17,7 +17,6 @@ from hyrl_mj.learning import WaySettings
 from hyrl_mj.policies import Policy
 from hyrl_mj.sets import GridSet, Nodes, check_points, resolving
 from hyrl_mj.simulation import WayRuns, policy_runs, way_runs
-from hyrl_mj.stages import strips
 from hyrl_mj.stages.refinement import refined, thinned
 from hyrl_mj.stages.ways import HomotopyClasses
 from hyrl_mj.tasks import ANY, Outcome, Task, number_of
@@ -148,14 +147,14 @@ def make_partition(
     )
     nodes, near = grid.nodes[simulated], None
     if first.passing is not None and eps and len(points):
-        width = strips.width(task, eps, longest_hop(task, policy, grid))
+        width = _strip_width(task, eps, longest_hop(task, policy, grid))
         hidden = float((task.noise_in_chart(eps) / task.chart.scale).max())
         a, b = neighbours
-        across = strips.across(task, nodes, points, 2 * max(hidden, grid.cell))
+        across = _across(task, nodes, points, 2 * max(hidden, grid.cell))
         neighbours = np.append(a, across[0]), np.append(b, across[1])
 
         def near(rows: np.ndarray) -> np.ndarray:
-            return strips.around_walls(task, nodes, (a, b), first.alive, rows, width) <= width
+            return _around_walls(task, nodes, (a, b), first.alive, rows, width) <= width
 
     ways = HomotopyClasses.from_runs(task, first, neighbours, near, settings)
     modes = ways.modes if len(points) else ()
@@ -182,6 +181,83 @@ def make_partition(
     unparted = () if modes or len(ways.modes) < 2 else ways.modes
     alone = 0 if ways.end.size < 2 else int(number_of(np.full((1, ways.end.size), ANY))[0])
     return Partition(modes or (alone,), parts, succeeds, ways.dropped, unparted)
+
+
+# ---- the strips of a part beside M*: how wide one is for the set of the other mode to end there
+#
+# A state from which nothing is left to decide belongs to every part. If the policy decides late, such states
+# lie close behind M*, and the set of the mode on the other side would reach over the strip between them. That
+# mode would then never end, and would itself have to decide where it turns back.
+
+
+def _strip_width(task: Task, eps: float, hop: np.ndarray) -> float:
+    """Returns the width that a strip needs, in scaled units.
+
+    The set of the other mode reaches 2 eps and a hop over M*, and eps and a hop over the other edge of the
+    strip. Between them a robot must not be able to pass unseen, which takes 2 eps and a hop. All of these act
+    along each coordinate, so that they are longer where M* lies across several.
+
+    Args:
+        task: gives the noisy coordinates.
+        eps: bound of the measurement noise.
+        hop: (d,) longest hop in one sample.
+    """
+    bounds = task.noise_in_chart(eps)
+    return float(np.linalg.norm((5 * bounds + 3 * hop) * (bounds > 0) / task.chart.scale))
+
+
+def _across(task: Task, nodes: np.ndarray, points: np.ndarray, reach: float) -> np.ndarray:
+    """Returns indices (2, k) of those of nodes (N, d) that lie opposite to each other across points of M*.
+
+    Runs from adjacent nodes so close to M* often fail, so pairs are taken across M*.
+
+    Args:
+        task: gives the chart.
+        nodes: (N, d).
+        points: (K, d) of M*.
+        reach: how far from a point both may lie, in scaled units.
+    """
+    chart = task.chart
+    # Of many points of M* a few hundred show the same nodes.
+    points = points[np.unique(np.linspace(0, len(points) - 1, 500).astype(int))]
+    tree = chart.tree(nodes)
+    close = tree.query_ball_point(chart.in_box(points), reach)
+    first = np.concatenate([np.empty(0, dtype=int), *map(np.asarray, close)]).astype(int)
+    over = np.repeat(points, [len(rows) for rows in close], axis=0)
+    mirrored = chart.wrap(over + chart.difference(over, nodes[first]))
+    return np.unique([first, tree.query(chart.in_box(mirrored))[1]], axis=1)
+
+
+def _around_walls(
+    task: Task,
+    nodes: np.ndarray,
+    neighbours: tuple[np.ndarray, np.ndarray],
+    free: np.ndarray,
+    rows: np.ndarray,
+    farthest: float,
+) -> np.ndarray:
+    """Returns the length of the shortest way from each node to the nearest of some: (N,) in scaled units.
+
+    It is infinite where no way leads, or only one longer than `farthest`.
+
+    Args:
+        task: gives the chart.
+        nodes: (N, d).
+        neighbours: (k,), (k,) indices of nodes that lie next to each other; ways lead from one to the other.
+        free: (N,) bool, the nodes that ways may lead through.
+        rows: indices of the nodes where ways end.
+        farthest: length beyond which ways are not followed, in scaled units.
+    """
+    from scipy.sparse import csr_array  # slow to import
+    from scipy.sparse.csgraph import dijkstra
+
+    a, b = (ends[free[neighbours[0]] & free[neighbours[1]]] for ends in neighbours)
+    lengths = task.chart.distance(nodes[a], nodes[b])
+    graph = csr_array((lengths, (a, b)), shape=(len(nodes), len(nodes)))
+    return np.asarray(dijkstra(graph, directed=False, indices=rows, min_only=True, limit=farthest))
+
+
+# ---- room for an agent's modes, and a policy for each part
 
 
 def with_room(
@@ -280,30 +356,17 @@ class PartPolicy:
             PartPolicy.KIND,
             lambda content: (float(content["near"]), bool(content.get("whole", False))),
         )
-        pi = part_policies(task, policy, partition, near)[partition.modes.index(mode)]
-        return replace(pi, whole=whole)
+        part = partition.parts[partition.modes.index(mode)]
+        return PartPolicy(task, policy, part.eroded(near), near, whole)
 
 
 def part_policies(
-    task: Task, policy: Policy, partition: Partition, near: float
-) -> tuple[PartPolicy, ...]:
-    """Returns pi_i of each mode; `near` is the width of the neighbourhood of M*."""
-    return tuple(PartPolicy(task, policy, part.eroded(near), near) for part in partition.parts)
-
-
-def part_policy(
-    task: Task, policy: Policy, partition: Partition, mode: int, eps: float
-) -> PartPolicy:
-    """Returns pi_i of a mode, with as wide a neighbourhood of M* as the noise and the steps need."""
-    return all_part_policies(task, policy, partition, eps)[partition.modes.index(mode)]
-
-
-def all_part_policies(
     task: Task, policy: Policy, partition: Partition, eps: float
-) -> tuple[PartPolicy, ...]:
-    """Returns pi_i of each mode, with as wide a neighbourhood of M* as `part_policy` takes."""
+) -> dict[int, PartPolicy]:
+    """Returns pi_i of each mode, with as wide a neighbourhood of M* as the noise and the steps need."""
     near = neighbourhood(partition, eps, longest_hop(task, policy, partition.grid))
-    return part_policies(task, policy, partition, near)
+    parts = zip(partition.modes, partition.parts, strict=True)
+    return {mode: PartPolicy(task, policy, part.eroded(near), near) for mode, part in parts}
 
 
 def neighbourhood(partition: Partition, eps: float, hop: np.ndarray) -> float:

@@ -13,8 +13,8 @@ from hyrl_mj.learning.distillation import distil, fits
 from hyrl_mj.learning.training import Score, train
 from hyrl_mj.policies import ALGORITHMS, MlpPolicy, Policy
 from hyrl_mj.stages.grounds import ModeGround
-from hyrl_mj.stages.partition import Partition, PartPolicy, part_policy
-from hyrl_mj.stages.tables import TableOf, TablePolicy
+from hyrl_mj.stages.partition import Partition, PartPolicy, part_policies
+from hyrl_mj.stages.tables import HeldInputs, TablePolicy, table_for
 
 # The policy of a mode: a trained network, pi_i, or a table.
 ModePolicy = MlpPolicy | PartPolicy | TablePolicy
@@ -40,7 +40,7 @@ def start_policy(
     task = ground.task
     if not ALGORITHMS[settings.algorithm].is_actor_critic:
         return policy if isinstance(policy, MlpPolicy) and fits(task, settings, policy) else None
-    pi = part_policy(task, policy, partition, ground.mode, ground.states.extended.eps)
+    pi = part_policies(task, policy, partition, ground.extended.eps)[ground.mode]
     return distil(task, pi, ground.starts, settings, seed)
 
 
@@ -52,7 +52,7 @@ def retrain(
     warm_start: WarmStart | None = None,
     others: Iterable[tuple[ModePolicy, ModeResult]] = (),
     part: PartPolicy | None = None,
-    table: TableOf | None = None,
+    held: HeldInputs | None = None,
     log_dir: Path | None = None,
 ) -> tuple[ModePolicy, ModeResult]:
     """Trains the policy of one mode (paper, Step 6).
@@ -71,7 +71,7 @@ def retrain(
             good enough for this mode.
         part: pi_i of the mode (paper, Step 4), which is used as it is if it is good enough, or else, without
             a table, the stage-1 policy itself; by default neither is tried.
-        table: returns a table of inputs for a mode; the better of it and pi_i then takes the place of the
+        held: what a table of inputs is made from; the better of it and pi_i then takes the place of the
             trainings.
         log_dir: folder of logs and checkpoints.
 
@@ -82,11 +82,15 @@ def retrain(
     """
     task, mode = ground.task, ground.mode
     tried: list[tuple[Score, ModePolicy]] = []
+
+    def suffices(policy: ModePolicy) -> bool:
+        tried.append((ground(policy), policy))
+        return ground.suffices(policy)
+
     if part is not None:
         # Without a table only trainings could follow: the agent is tried unchanged, too.
-        for untrained in (part,) if table else (part, part.undivided):
-            tried.append((ground(untrained), untrained))
-            if ground.suffices(untrained):
+        for untrained in (part,) if held else (part, part.undivided):
+            if suffices(untrained):
                 return untrained, _result(ground, untrained, 0)
     if task.mirror is not None:
         for other, result in others:
@@ -96,36 +100,24 @@ def retrain(
             won = ground.won_by_image(image, result.won)
             if won is not None:
                 return image, ModeResult(mode, won, 0)
-    if table is not None:
-        made = table(mode)
-        tried.append((ground(made), made))
-    if table is not None or (tried and ground.nearly_won(max(score for score, _ in tried))):
-        return _best(ground, tried, 0)
     trainings = 0
-    for attempt in range(settings.attempts):
+    if held is not None:
+        suffices(table_for(held, mode))
+    enough = held is not None or max([score for score, _ in tried], default=()) >= ground.nearly
+    for attempt in range(0 if enough else settings.attempts):
         draw = int(np.random.SeedSequence([seed, 1 + mode, attempt]).generate_state(1)[0])
         warm = None
         if warm_start is not None and settings.warm_start and not attempt:
             warm = warm_start(ground, settings, draw)
-        if warm is not None:
-            tried.append((ground(warm), warm))
-            if ground.suffices(warm):
-                break
+        if warm is not None and suffices(warm):
+            break
         label = f"mode {mode}, attempt {attempt + 1}" if attempt else f"mode {mode}"
         trained = train(
             task, settings, draw, ground=ground, start_from=warm, log_dir=log_dir, label=label
         )
         trainings += 1
-        tried.append((ground(trained), trained))
-        if ground.suffices(trained):
+        if suffices(trained):
             break
-    return _best(ground, tried, trainings)
-
-
-def _best(
-    ground: ModeGround, tried: list[tuple[Score, ModePolicy]], trainings: int
-) -> tuple[ModePolicy, ModeResult]:
-    """Returns the policy with the best score, and how its mode ended."""
     best = max(tried, key=lambda result: result[0])[1]
     return best, _result(ground, best, trainings)
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from hyrl_mj.learning import WaySettings
 from hyrl_mj.policies import Policy, PolicyController
-from hyrl_mj.simulation import Rollout, Sample, Signal, WayRuns, closed_loop, way_runs
+from hyrl_mj.simulation import Rollout, Rows, Sample, Signal, WayRuns, closed_loop, way_runs
 from hyrl_mj.stages.ways import HomotopyClasses
 from hyrl_mj.tasks import Outcome, Task
 
@@ -84,8 +84,8 @@ def _across(
     return first, second
 
 
-@dataclass
-class _Side:
+@dataclass(frozen=True)
+class _Side(Rows):
     """One side of pairs of starts.
 
     Attributes:
@@ -97,14 +97,6 @@ class _Side:
     z: np.ndarray
     runs: WayRuns
     paths: np.ndarray
-
-    def move(self, rows: np.ndarray, other: _Side) -> None:
-        """Puts others (k,) in the rows (k,)."""
-        self.z[rows], self.paths[rows] = other.z, other.paths
-        self.runs.put(rows, other.runs)
-
-    def __getitem__(self, rows: np.ndarray) -> _Side:
-        return _Side(self.z[rows], self.runs[rows], self.paths[rows])
 
 
 def _paths(task: Task, rollout: Rollout) -> np.ndarray:
@@ -154,8 +146,8 @@ def _bisected(
             fails = left[~works]
             d[fails] = np.where(known[fails, None], d[fails], middle[~works])
             c[fails], known[fails] = middle[~works], True
-            a.move(left[same], found[same])
-            b.move(left[other], found[other])
+            a.put(left[same], found[same])
+            b.put(left[other], found[other])
             c[left[other]], known[left[other]] = middle[other], False
             # Without failures in between, c is b and d is a.
             d[left] = np.where(known[left, None], d[left], a.z[left])

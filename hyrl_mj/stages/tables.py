@@ -327,7 +327,3 @@ def _in_reach(
     )
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(count > ROUNDING, total / count, np.inf)
-
-
-# Returns the table of a mode.
-TableOf = Callable[[int], TablePolicy]

@@ -66,7 +66,7 @@ class HomotopyClasses:
             runs: (n,) of the nodes.
             neighbours: (k,), (k,) indices of nodes that lie next to each other.
             near: tells which nodes are so close to others, where ways part, that they have to decide, too
-                (see `strips`). By default none are.
+                (see `make_partition`). By default none are.
             settings: how few nodes make no mode, and what is near.
 
         Raises:

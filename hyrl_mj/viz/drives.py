@@ -15,7 +15,6 @@ from hyrl_mj.fields import (
     check_passable,
     drive,
     ending,
-    is_local,
     least_clearance,
     noise_cautions,
     read_field,
@@ -141,7 +140,7 @@ def _parts(run: Run) -> tuple[Field, MlpPolicy, Mapping[int, MlpPolicy]]:
     """
     remedy = "make one with hyrl-mj run field --out runs/field"
     local = run.task
-    if not is_local(local):
+    if not isinstance(local, Field):
         raise BadInput(
             f"{run.path} is a run of {local.name}, but drive takes a run of field: {remedy}"
         )

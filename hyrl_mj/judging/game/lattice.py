@@ -157,9 +157,7 @@ class Lattice(Places):
         Lattice.check(task)
         grid = grid or lattice_grid(task)
         nodes = grid.nodes
-        plant = task.plant(len(nodes))
-        plant.set_state(*task.state(nodes))
-        measurement = plant.measurement
+        measurement = task.placed(nodes).measurement
         ending, failed = task.ending(measurement), task.failed(measurement)
         arrived = ending == Outcome.REACHED
         running = ending == Outcome.RUNNING
@@ -178,19 +176,28 @@ class Lattice(Places):
         direct = measurement.shape == nodes.shape and bool((measurement == nodes).all())
         estimate = Lattice.why_estimate(task) is not None
         occurs = nearest_of(grid, running) if task.abilities.stopped_by_walls else None
-        ends = _Ends(grid, len(levels), estimate, occurs)
-        hops, uneven = np.empty((len(levels), nodes.shape[1])), np.zeros(nodes.shape[1])
-        for a, measurement in enumerate(_one_sample_on(task, nodes[alive], levels, direct)):
-            z = task.z(measurement)
+        rng, d = np.random.default_rng(0) if estimate else None, nodes.shape[1]
+        after = np.empty((len(levels), 1 if estimate else 2**d, len(nodes)), dtype=np.int32)
+        after[:] = np.arange(len(nodes))
+        hops, uneven, between = np.empty((len(levels), d)), np.zeros(d), np.zeros(d, dtype=bool)
+        for a, end in enumerate(_one_sample_on(task, nodes[alive], levels, direct)):
+            z = task.z(end)
             hop = grid.chart.difference(z, nodes[alive])
             hops[a] = (hop.max(axis=0) + hop.min(axis=0)) / 2
             uneven = np.maximum(uneven, np.ptp(hop, axis=0) / 2)
-            arrives = task.ending(measurement) == Outcome.REACHED
+            arrives = task.ending(end) == Outcome.REACHED
             # A running episode that leaves the chart leaves the lattice: it counts as failed.
-            fails = task.failed(measurement) | ~task.chart.contains(z) & ~arrives
-            ends.add(a, alive, z, np.select([fails, arrives], [len(nodes) + 1, len(nodes)], -1))
-        after = ends.after
-        arrived |= ~failed & (task.verdict(plant.measurement) == Outcome.REACHED)
+            fails = task.failed(end) | ~task.chart.contains(z) & ~arrives
+            around, differ = _around(grid, z, rng)
+            between |= differ
+            around = around if occurs is None else occurs[around]
+            over = [len(nodes) + 1, len(nodes)]
+            after[a][:, alive] = np.select([fails, arrives], over, around)
+        # Corners that repeat others are not needed.
+        corners = np.array([*product((0, 1), repeat=d)])[: after.shape[1]]
+        needed = ~(corners > between).any(axis=1)
+        after = after if needed.all() else after[:, needed]
+        arrived |= ~failed & (task.verdict(measurement) == Outcome.REACHED)
         return Lattice(arrived, failed, running, task, grid, levels, after, hops, uneven, direct)
 
     def level_of(self, u: np.ndarray) -> np.ndarray:
@@ -261,52 +268,25 @@ def _levels(task: Task, grid: Grid) -> np.ndarray:
     return np.array(list(product(*map(np.linspace, low, high, counts))))
 
 
-class _Ends:
-    """The places to which the samples of all nodes lead, level by level.
+def _around(
+    grid: Grid, z: np.ndarray, rng: np.random.Generator | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the nodes (C, n) around points (n, d), the nearest first, and along which axes they differ.
 
-    Args:
-        grid: the nodes.
-        levels: number of levels.
-        estimate: whether a sample leads to one node that is drawn, and not to all around its end.
-        occurs: (N,) the node that stands for each, where not all of them occur.
+    With a generator it is one node, C = 1, drawn so that it is right on average.
     """
-
-    def __init__(self, grid: Grid, levels: int, estimate: bool, occurs: np.ndarray | None):
-        d, nodes = len(grid.counts), len(grid.nodes)
-        self._grid = grid
-        self._rng = np.random.default_rng(0) if estimate else None
-        self._occurs = occurs
-        # Which of the two nodes along each coordinate a corner takes.
-        self._corners = [(0,) * d] if self._rng else list(product((0, 1), repeat=d))
-        self._between = np.zeros(d, dtype=bool)
-        self._after = np.empty((levels, len(self._corners), nodes), dtype=np.int32)
-        self._after[:] = np.arange(nodes)
-
-    def add(self, level: int, nodes: np.ndarray, z: np.ndarray, ended: np.ndarray) -> None:
-        """Adds the ends z (n, d) of the samples of some nodes (n,).
-
-        `ended` (n,) int is the place where a sample ends the episode, otherwise -1.
-        """
-        grid = self._grid
-        index = (grid.chart.wrap(z) - grid.chart.low) / grid.spacing
-        near = np.round(index)
-        far = near + np.where(np.abs(index - near) <= ON_NODE, 0, np.sign(index - near))
-        self._between |= (far != near).any(axis=0)
-        if self._rng:
-            near = np.where(self._rng.random(index.shape) < np.abs(index - near), far, near)
-        counts = np.array(grid.counts)
-        strides = np.append(np.cumprod(counts[:0:-1])[::-1], 1)
-        around = [
-            np.where(grid.chart.periodic, at % counts, np.clip(at, 0, counts - 1)) * strides
-            for at in (near.astype(int), far.astype(int))
-        ]
-        for c, corner in enumerate(self._corners):
-            place = sum(around[which][:, axis] for axis, which in enumerate(corner))
-            place = place if self._occurs is None else self._occurs[place]
-            self._after[level, c, nodes] = np.where(ended < 0, place, ended)
-
-    @property
-    def after(self) -> np.ndarray:
-        """(A, C, N) places, without corners that repeat others."""
-        needed = [not (np.array(corner) > self._between).any() for corner in self._corners]
-        return self._after if all(needed) else self._after[:, needed]
+    index = (grid.chart.wrap(z) - grid.chart.low) / grid.spacing
+    near = np.round(index)
+    far = near + np.where(np.abs(index - near) <= ON_NODE, 0, np.sign(index - near))
+    between = (far != near).any(axis=0)
+    if rng is not None:
+        near = np.where(rng.random(index.shape) < np.abs(index - near), far, near)
+    counts = np.array(grid.counts)
+    strides = np.append(np.cumprod(counts[:0:-1])[::-1], 1)
+    ends = [
+        np.where(grid.chart.periodic, at % counts, np.clip(at, 0, counts - 1)) * strides
+        for at in (near.astype(int), far.astype(int))
+    ]
+    corners = [*product((0, 1), repeat=len(counts))][: None if rng is None else 1]
+    nodes = [sum(ends[i][:, axis] for axis, i in enumerate(corner)) for corner in corners]
+    return np.stack(nodes), between

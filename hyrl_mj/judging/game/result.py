@@ -239,24 +239,20 @@ class GameResult:
 
     def is_whole(self, controllers: Collection[str]) -> bool:
         """Whether all tables have the same controllers, and as many rows as noise bounds."""
-        examined = {*controllers}
+        examined, rows = {*controllers}, len(self.curve.eps)
         replayed = [count.controller for count in self.replays if count.is_whole]
-        if len(replayed) < len(self.replays) or not {*replayed} <= examined:
-            return False
-        if len({*replayed}) < len(replayed) or not {*self.sensed} <= examined:
-            return False
-        whole = (self.margin, self.proved_margin, self.miss_without_noise)
-        if any(set(table) != examined for table in whole) or not {*self.why_not_proved} <= examined:
-            return False
-        tables = (self.scores, self.curve.wins, self.profile.eps)
-        if any(set(table) != examined | {LIMIT} for table in tables):
-            return False
+        of_all = (self.margin, self.proved_margin, self.miss_without_noise)
+        with_limit = (self.scores, self.curve.wins, self.profile.eps)
         columns = [w for wins in self.curve.wins.values() for w in vars(wins).values() if w]
         return (
-            all(self.scores.values())
+            len({*replayed}) == len(replayed) == len(self.replays)
+            and {*replayed, *self.sensed, *self.why_not_proved} <= examined
+            and all({*table} == examined for table in of_all)
+            and all({*table} == examined | {LIMIT} for table in with_limit)
+            and all(self.scores.values())
             and len(set(map(len, self.scores.values()))) == 1
-            and len(self.curve.eps) > 0
-            and set(map(len, [self.curve.winnable, *columns])) == {len(self.curve.eps)}
+            and rows > 0
+            and set(map(len, [self.curve.winnable, *columns])) == {rows}
             and set(map(len, self.profile.eps.values())) == {len(self.profile.points)}
         )
 

@@ -57,9 +57,9 @@ class Game:
         self._noises: dict[tuple[str, float], Signal] = {}
         self._values: dict[tuple[str, float], np.ndarray] = {}
         most = self.bound(largest)
+        self.controllers = {name: as_controller(loop) for name, loop in controllers.items()}
         self.answers = {
-            name: Answers.ask(self.lattice, as_controller(loop), most)
-            for name, loop in controllers.items()
+            name: Answers.ask(self.lattice, loop, most) for name, loop in self.controllers.items()
         }
 
     def bound(self, eps: float) -> np.ndarray:
@@ -187,7 +187,6 @@ def share(won: np.ndarray) -> float:
 def worst_signal(
     game: Game,
     name: str,
-    controller: Controller | Policy,
     z0: np.ndarray,
     eps: float,
     q0: int | None = None,
@@ -200,7 +199,7 @@ def worst_signal(
     """
     noise = game.worst_noise(name, eps)
     modes = None if q0 is None else np.full(len(z0), q0)
-    loop, settings = as_controller(controller), LoopSettings(steps=steps, record=True)
+    loop, settings = game.controllers[name], LoopSettings(steps=steps, record=True)
     rollout = closed_loop(game.task, loop, z0, noise, modes, settings=settings)
     if not len(rollout.measured):  # all runs are over where they start
         none = np.zeros((1, len(z0), game.task.measurement_columns))

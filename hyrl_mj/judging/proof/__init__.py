@@ -8,5 +8,3 @@ cover the chart; `why_no_cells` tells what is in the way.
 from hyrl_mj.judging.proof.cells import why_no_cells
 from hyrl_mj.judging.proof.certificate import Certificate
 from hyrl_mj.judging.proof.counterexamples import CellNoise, find_counterexamples
-
-__all__ = ["CellNoise", "Certificate", "find_counterexamples", "why_no_cells"]

@@ -11,7 +11,7 @@ import numpy as np
 from hyrl_mj.judging.proof.affine import Unbounded
 from hyrl_mj.judging.proof.assumptions import check_assumptions
 from hyrl_mj.judging.proof.cells import TINY, Cells
-from hyrl_mj.judging.proof.networks import BoundedPolicy
+from hyrl_mj.judging.proof.networks import BoundedPolicy, in_chunks
 from hyrl_mj.policies import ON_EDGE, Controller, HybridController, PolicyController
 from hyrl_mj.sets import Everything, Grid, GridSet, StateSet, within_reach
 from hyrl_mj.tasks import Task
@@ -69,7 +69,7 @@ class Boxes:
         whole: np.ndarray | None = None
         while len(index):
             centre = self.low + self.step * (index + size / 2)
-            found = bounds(centre, self.step * size / 2 + self.cells.slack)
+            found = in_chunks(bounds, centre, self.step * size / 2 + self.cells.slack)
             if whole is None:
                 whole = np.empty((*counts, *found.shape[1:]), dtype=found.dtype)
             sharp = _is_sharp(found) | (size == 1).all()

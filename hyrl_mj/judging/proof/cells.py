@@ -76,7 +76,10 @@ class Cells(Places):
         if not lattice.direct:
             raise Unbounded(f"the chart of {task.name} is not its position")
         periodic, h = np.array(task.chart.periodic), grid.spacing
-        slope, offset = _displacement(lattice)
+        # The displacement is linear in the inputs.
+        levels = np.hstack([lattice.levels, np.ones((len(lattice.levels), 1))])
+        fit, *_ = np.linalg.lstsq(levels, lattice.hops, rcond=None)
+        slope, offset = fit[:-1].T, fit[-1]
         error = _error(lattice, slope, offset)
         if (error > ALIKE * (h if spacing is None else spacing)).any():
             raise Unbounded(
@@ -240,13 +243,6 @@ class Cells(Places):
         return self.middle(cells) + off * self.lattice.grid.spacing
 
 
-def _displacement(lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
-    """Returns slope (d, m) and offset (d,) of the displacement as a function of the input."""
-    levels = np.hstack([lattice.levels, np.ones((len(lattice.levels), 1))])
-    fit, *_ = np.linalg.lstsq(levels, lattice.hops, rcond=None)
-    return fit[:-1].T, fit[-1]
-
-
 def _ends(task: Task, boxes: Affine) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns where an episode may fail, surely ends as a success, or is one if cut off: (n,) bool each."""
     found = []
@@ -274,8 +270,7 @@ def _error(lattice: Lattice, slope: np.ndarray, offset: np.ndarray) -> np.ndarra
     spread = np.zeros_like(off)
     rng, low, high = np.random.default_rng(0), *task.input_limits
     z = task.chart.draw(STATES, rng)
-    plant = task.plant(STATES)
-    plant.set_state(*task.state(z))
+    plant = task.placed(z)
     for _ in range(SAMPLES):
         drawn = rng.uniform(low, high, (STATES, len(low)))
         corners = np.where(rng.random(drawn.shape) < 0.5, low, high)
@@ -298,8 +293,7 @@ def _carried(lattice: Lattice) -> np.ndarray:
         np.tile(lattice.levels, (len(before), 1)),
     )
     start = grid.nodes[np.flatnonzero(lattice.running)[:1]]
-    plant = task.plant(len(first))
-    plant.set_state(*task.state(np.repeat(start, len(first), axis=0)))
+    plant = task.placed(np.repeat(start, len(first), axis=0))
     plant.step(first)
     middle = plant.measurement
     plant.step(then)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -34,12 +34,14 @@ class Certificate:
 
     Attributes:
         game: the game on the nodes.
+        controllers: by name.
         cells: the cells between them.
         answers: the bounded answers of the controllers that can be bounded, by name.
         why_not: for the other controllers, what stopped it.
     """
 
     game: Game
+    controllers: Mapping[str, Controller]
     cells: Cells | None
     answers: Mapping[str, BoundedAnswers]
     why_not: Mapping[str, str]
@@ -48,19 +50,20 @@ class Certificate:
     @staticmethod
     def certify(game: Game, controllers: Mapping[str, Controller]) -> Certificate:
         """Returns the certificate of some controllers of a game."""
-        answers, why_not = {}, {}
+        answers, why_not = {}, dict[str, str]()
         if why := game.lattice.why_estimate(game.task):
-            return Certificate(game, None, {}, dict.fromkeys(controllers, why))
+            return Certificate(game, controllers, None, {}, dict.fromkeys(controllers, why))
         try:
             cells = Cells.cover(game.lattice)
         except Unbounded as error:
-            return Certificate(game, None, {}, dict.fromkeys(controllers, str(error)))
+            why_not = dict.fromkeys(controllers, str(error))
+            return Certificate(game, controllers, None, {}, why_not)
         for name, controller in controllers.items():
             try:
                 answers[name] = BoundedAnswers.enclose(cells, controller, game.bound(game.largest))
             except Unbounded as error:
                 why_not[name] = str(error)
-        return Certificate(game, cells, answers, why_not)
+        return Certificate(game, controllers, cells, answers, why_not)
 
     def moves(self, name: str, eps: float) -> Moves:
         """Returns the adversary's moves against a controller, from outside."""
@@ -68,17 +71,11 @@ class Certificate:
         assert cells is not None
         rows = []
         for row in self.answers[name].possible(bound):
-            nodes, modes, ends = [], [], []
+            parts = []
             for mode, shift, reached in row:
                 node = np.flatnonzero(reached & cells.running)
-                nodes.append(node)
-                modes.append(np.full(len(node), mode))
-                ends.append(cells.after(shift)[node])
-            node = np.concatenate(nodes)
-            order = np.argsort(node, kind="stable")
-            rows.append(
-                (node[order], np.concatenate(modes)[order], np.concatenate(ends)[order][:, None])
-            )
+                parts.append((node, np.full(len(node), mode), cells.after(shift)[node]))
+            rows.append(in_order(parts))
         return Moves.gather(cells, rows)
 
     def value(self, name: str, eps: float) -> np.ndarray:
@@ -107,6 +104,13 @@ class Certificate:
         latest, latest_any = (float(x[x < NEVER].max(initial=0)) for x in (own, worst))
         dt = self.game.task.dt
         return Proved(share(own < NEVER), share(worst < NEVER), latest * dt, latest_any * dt)
+
+
+def in_order(parts: Sequence[tuple[np.ndarray, ...]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns a row of `Moves.gather` from parts of it: nodes (k,) in any order, modes (k,), places (k,)."""
+    node, mode, ends = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    order = np.argsort(node, kind="stable")
+    return node[order], mode[order], ends[order][:, None]
 
 
 def staying(moves: Moves, places: Places, success: np.ndarray) -> np.ndarray:

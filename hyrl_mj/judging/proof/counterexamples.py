@@ -41,9 +41,7 @@ class Broken:
     tried: np.ndarray
 
 
-def find_counterexamples(
-    certificate: Certificate, name: str, controller: Controller, eps: float
-) -> Broken:
+def find_counterexamples(certificate: Certificate, name: str, eps: float) -> Broken:
     """Attacks a controller where it may lose, and returns where it lost.
 
     From the nodes that are lost in the game its adversary gives the noise. Where the game is an estimate, as
@@ -55,10 +53,9 @@ def find_counterexamples(
     Args:
         certificate: what is proved.
         name: the name of the controller.
-        controller: the controller.
         eps: the noise bound.
     """
-    game, cells = certificate.game, certificate.cells
+    game, cells, controller = certificate.game, certificate.cells, certificate.controllers[name]
     modes = np.array(start_modes(controller))
     value, rng = game.value(name, eps), np.random.default_rng(0)
     region = game.starts & game.winnable(eps)
@@ -82,8 +79,7 @@ def find_counterexamples(
         return Broken(nodes[-1], np.asarray(nodes.any(axis=0)), tried)
     broken = np.stack([cells.some_corner(row) for row in nodes])
     if name in certificate.answers:
-        outer = certificate.value(name, eps)
-        inside = CellNoise(certificate, controller, outer, value, game.bound(eps))
+        outer, inside = certificate.value(name, eps), CellNoise(certificate, name, eps)
         unclear = (outer[-len(modes) :, :-2] >= NEVER) & certificate.region(eps) & ~broken
         chosen = [_inside(cells, np.flatnonzero(of_mode), rng) for of_mode in unclear]
         at, starts = (np.concatenate(parts) for parts in zip(*chosen, strict=True))
@@ -125,29 +121,21 @@ class CellNoise(Signal):
     Worst is a state that is lost at the nearest node, then one that is not proved, then the latest to arrive.
 
     Args:
-        certificate: gives the cells.
-        controller: the controller that it acts against.
-        outer: (modes + 1, places) value of the certificate.
-        inner: (modes + 1, places) value of the game on nodes.
-        bound: (d,) noise bound.
+        certificate: gives the cells, and its value beside that of the game on nodes.
+        name: the controller that it acts against.
+        eps: noise bound.
     """
 
     kind = "cells"
     needs_controller = True
 
-    def __init__(
-        self,
-        certificate: Certificate,
-        controller: Controller,
-        outer: np.ndarray,
-        inner: np.ndarray,
-        bound: np.ndarray,
-    ):
+    def __init__(self, certificate: Certificate, name: str, eps: float):
         assert certificate.cells is not None
+        bound = certificate.game.bound(eps)
         largest = float(bound.max())
         super().__init__(largest, bound / (largest or 1.0))
-        self._cells, self._controller = certificate.cells, controller
-        self._outer, self._inner = outer, inner
+        self._cells, self._controller = certificate.cells, certificate.controllers[name]
+        self._outer, self._inner = certificate.value(name, eps), certificate.game.value(name, eps)
         # So many measurements along each noisy coordinate the noise between the nodes chooses from.
         steps = [np.linspace(-b, b, 17 if b else 1) for b in bound]
         candidates = np.array([*product(*steps)])

@@ -22,14 +22,6 @@ from hyrl_mj.judging.proof.affine import (
 # ---- functions of one quantity
 
 
-def may_be_infinite(a: Affine) -> np.ndarray:
-    return a.wild
-
-
-def may_be_negative(a: Affine) -> np.ndarray:
-    return ~a.positive
-
-
 def smooth(
     value: Callable[[np.ndarray], np.ndarray],
     slope: Callable[[np.ndarray], np.ndarray],
@@ -89,7 +81,7 @@ sqrt = smooth(
     lambda x: 0.5 / root(x),
     lambda low, _: 0.25 * root(low) ** -3,
     rising(root),
-    may_be_negative,
+    lambda a: ~a.positive,
     nonnegative=True,
 )
 _reciprocal = smooth(

@@ -90,13 +90,6 @@ class BoundedPolicy:
             centre: (n, d) middle of each box.
             half: (d,) half of its sides.
         """
-        return _in_chunks(self._levels, centre, half)
-
-    def inputs(self, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
-        """Returns the least and greatest inputs in boxes, as for `levels`: (n, 2, m)."""
-        return _in_chunks(self._inputs, centre, half)
-
-    def _levels(self, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
         x = self._hidden(centre, half)
         weight, bias = self.network.layers[-1]
         k = len(bias)
@@ -112,7 +105,8 @@ class BoundedPolicy:
         worse = (least > 0).reshape(-1, k, k).any(axis=1)
         return np.asarray(~worse)
 
-    def _inputs(self, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
+    def inputs(self, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
+        """Returns the least and greatest inputs in boxes, as for `levels`: (n, 2, m)."""
         x = _linear(self._hidden(centre, half), *self.network.layers[-1])
         ends = np.stack([x.low, x.high], axis=1).astype(float)
         low, high = self.network.task.input_limits
@@ -143,9 +137,10 @@ class BoundedPolicy:
         return x
 
 
-def _in_chunks(
+def in_chunks(
     work: Callable[[np.ndarray, np.ndarray], np.ndarray], centre: np.ndarray, half: np.ndarray
 ) -> np.ndarray:
+    """Returns what some work does with boxes, some of them at a time, on all cores."""
     size = 2048  # boxes that go through a network at a time
     parts = [centre[i : i + size] for i in range(0, len(centre), size)]
     with BLAS.limit(limits=1, user_api="blas"), ThreadPoolExecutor(cores.count()) as pool:

@@ -48,7 +48,6 @@ class Batch:
     """Starts that are played at once.
 
     Attributes:
-        controller: the controller.
         noise: the noise.
         kind: its kind.
         z0: (n, d) chart points.
@@ -58,7 +57,6 @@ class Batch:
             episodes.
     """
 
-    controller: Controller
     noise: AnyNoise
     kind: str
     z0: np.ndarray
@@ -67,9 +65,7 @@ class Batch:
     steps: np.ndarray | None = None
 
 
-def replay(
-    certificate: Certificate, name: str, controller: Controller, score: Score
-) -> ReplayCount | None:
+def replay(certificate: Certificate, name: str, score: Score) -> ReplayCount | None:
     """Plays in MuJoCo what a score says before it is believed, and returns what was lost.
 
     Where something is proved these are starts anywhere in proved cells, for each start mode and for the mode
@@ -91,12 +87,12 @@ def replay(
     of = "won" if whole and not nearly else "proved"
     # A tenth of the starts is played where so little is proved that no word follows from it.
     few = 1 if nearly or whole else 10
-    batches = batches_of(certificate, name, controller, score.eps, of, few)
+    batches = batches_of(certificate, name, score.eps, of, few)
     starts, lost = ({batch.kind: 0 for batch in batches} for _ in range(2))
     judged, first = 0, None
     # One after the other: the physics takes all cores, and the rest holds the interpreter's lock.
     for batch in progress_bar(batches, "replays", "games"):
-        run, again = play(game.task, batch)
+        run, again = play(game.task, certificate.controllers[name], batch)
         losing = np.flatnonzero(run.outcome != Outcome.REACHED)
         starts[batch.kind] += len(run.outcome)
         lost[batch.kind] += len(losing)
@@ -110,31 +106,26 @@ def replay(
 
 
 def batches_of(
-    certificate: Certificate,
-    name: str,
-    controller: Controller,
-    eps: float,
-    of: str,
-    few: int = 1,
+    certificate: Certificate, name: str, eps: float, of: str, few: int = 1
 ) -> list[Batch]:
     """Returns one in `few` of the `STARTS` of which something is said, with their noise.
 
     Of each kind of noise the first `WHOLE` episodes are played to their end. The others are until they are
     proved to have arrived for good.
     """
-    rng, pools = np.random.default_rng(0), _pools(certificate, name, controller, eps, of)
+    rng, pools = np.random.default_rng(0), _pools(certificate, name, eps, of)
     batches = []
-    for kind, noise in _noises(certificate, name, controller, eps).items():
+    for kind, noise in _noises(certificate, name, eps).items():
         z0, q0, samples = _drawn(pools, STARTS[kind] // few, rng)
         for first in (0, *range(WHOLE, len(z0), BATCH)):
             part = slice(first, first + BATCH if first else WHOLE)
             number = int(rng.integers(2**31))
             steps = samples[part] if first else None
-            batches.append(Batch(controller, noise, kind, z0[part], q0[part], number, steps))
+            batches.append(Batch(noise, kind, z0[part], q0[part], number, steps))
     return batches
 
 
-def play(task: Task, batch: Batch) -> tuple[Rollout, int]:
+def play(task: Task, controller: Controller, batch: Batch) -> tuple[Rollout, int]:
     """Plays a batch on the plant, and every twentieth run and all lost ones once more in plain MuJoCo.
 
     A batch is played to its end only if one of its runs has not arrived when that is proved.
@@ -148,9 +139,7 @@ def play(task: Task, batch: Batch) -> tuple[Rollout, int]:
     plant = task.plant(len(batch.z0))
     for steps in (batch.steps, None):
         settings = LoopSettings(steps, record=True, states=False, plant=plant, quiet=True)
-        run = closed_loop(
-            task, batch.controller, batch.z0, batch.noise, batch.q0, batch.seed, settings
-        )
+        run = closed_loop(task, controller, batch.z0, batch.noise, batch.q0, batch.seed, settings)
         judged = run.outcome != Outcome.REACHED
         if steps is None or not judged.any():
             break
@@ -159,9 +148,7 @@ def play(task: Task, batch: Batch) -> tuple[Rollout, int]:
     return run, int(judged.sum())
 
 
-def _noises(
-    certificate: Certificate, name: str, controller: Controller, eps: float
-) -> dict[str, AnyNoise]:
+def _noises(certificate: Certificate, name: str, eps: float) -> dict[str, AnyNoise]:
     """Returns the noise signals that are known, the strongest last, by kind."""
     game = certificate.game
     simple = {kind: Noise(kind, eps, game.everywhere) for kind in ("uniform", "alternating")}
@@ -169,8 +156,7 @@ def _noises(
     if covers_sensor(game.task, eps):
         noises[SENSOR] = Noise(SENSOR)
     if name in certificate.answers:
-        outer, inner = certificate.value(name, eps), game.value(name, eps)
-        noises["cells"] = CellNoise(certificate, controller, outer, inner, game.bound(eps))
+        noises["cells"] = CellNoise(certificate, name, eps)
     return noises
 
 
@@ -207,15 +193,13 @@ class _Pool:
         return z0, q0, samples
 
 
-def _pools(
-    certificate: Certificate, name: str, controller: Controller, eps: float, of: str
-) -> list[_Pool]:
+def _pools(certificate: Certificate, name: str, eps: float, of: str) -> list[_Pool]:
     """Returns where starts are drawn, for each start mode of which something is said."""
     game, cells, region = certificate.game, certificate.cells, certificate.region(eps)
     if not region.any():  # a start region thinner than a cell
         cells, region = None, game.starts & game.winnable(eps)
     grid, rng, pools = game.lattice.grid, np.random.default_rng(0), []
-    modes = start_modes(controller)
+    modes = start_modes(certificate.controllers[name])
     proved = of == "proved" and cells is not None
     values = (certificate if proved else game).value(name, eps)[:, :-2]
     if cells is not None and not proved:

@@ -17,7 +17,7 @@ import numpy as np
 from hyrl_mj.judging.game import NEVER, Moves, Places, SensedScore, share, solve
 from hyrl_mj.judging.proof.answers import BoundedAnswers
 from hyrl_mj.judging.proof.cells import Cells
-from hyrl_mj.judging.proof.certificate import Certificate, staying
+from hyrl_mj.judging.proof.certificate import Certificate, in_order, staying
 from hyrl_mj.simulation import Sensor
 
 # Parts of the range of a bias, for one noisy coordinate and for several. A bias lies anywhere in its part, so
@@ -161,16 +161,12 @@ def _moves(
     rows = []
     for number, row in enumerate(answers.possible(added, bias)):
         here = occurs if number < len(answers.modes) else begins
-        nodes, modes, ends = [], [], []
+        parts = []
         for mode, shift, reached in row:
             at, cell = np.nonzero(reached[shown] & here)
             end = cells.after(shift)[cell]
             for to in memory.after[:, shifts.index(tuple(shift.tolist()))].T:
-                nodes.append(at * n + cell)
-                modes.append(np.full(len(at), mode))
-                ends.append(np.where(end < n, to[at] * n, (many - 1) * n) + end)
-        node = np.concatenate(nodes)
-        order = np.argsort(node, kind="stable")
-        row_ends = np.concatenate(ends)[order][:, None]
-        rows.append((node[order], np.concatenate(modes)[order], row_ends))
+                ends = np.where(end < n, to[at] * n, (many - 1) * n) + end
+                parts.append((at * n + cell, np.full(len(at), mode), ends))
+        rows.append(in_order(parts))
     return Moves.gather(places, rows), places
