@@ -22,7 +22,7 @@ from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.partition import Partition
 from hyrl_mj.viz import colours, figures
 from hyrl_mj.viz.figures import charts, runs, style
-from hyrl_mj.viz.report import pictures
+from hyrl_mj.viz.pages import pictures
 from hyrl_mj.viz.section import Section
 
 CIRCLE, VEHICLE = hyrl_mj.get_task("unit_circle"), hyrl_mj.get_task("vehicle")

@@ -34,7 +34,7 @@ from hyrl_mj.runs import sweeps
 from hyrl_mj.runs.directory import Run, write_config
 from hyrl_mj.runs.sweeps import Common, Row, Setting, Sweep
 from hyrl_mj.system import cores, progress
-from hyrl_mj.viz import commands, sweep_tables
+from hyrl_mj.viz import commands, sweep_tables, tables
 
 CIRCLE = Setting("unit_circle", "", 0.1)
 SMOKE = {"preset": "smoke", "set": TINY}
@@ -240,7 +240,7 @@ def test_tables_show_median_least_and_greatest():
         ["runs", "3 of 4"], ["verdicts", "3 WON"], ["HyRL proved, own q0", "75.00% (50.00% to 100%)"],
     ]  # fmt: skip
     assert sweep_tables.worst(rows).seed == 1
-    assert sweep_tables.markdown(table).splitlines()[1] == "| --- | --- |"
+    assert tables.markdown(table).splitlines()[1] == "| --- | --- |"
 
 
 def test_what_runs_say_reads_well_in_a_log():

@@ -54,7 +54,8 @@ def result_table(compared: Compared, brief: bool = False) -> Table:
             row["samples trained"] = f"{np.mean([r.samples for r in of]):,.0f}"
             row["seconds"] = f"{np.mean([r.seconds for r in of]):.0f}"
         rows.append(row)
-    return Table.of(f"{compared.task}: what would do instead, noise {compared.eps:g}", rows)
+    title = f"{compared.task}: what would do instead, noise {compared.eps:g}"
+    return Table.of(title, rows, "Means over the seeds (least to greatest where they differ).")
 
 
 def _settings(rows: list[Row]) -> str:
@@ -83,7 +84,12 @@ def tried_table(compared: Compared) -> Table | None:
             taken = f"{chosen} of {len(won)}"
             rows.append([of[0].title, label, _cell(won, True), taken])
     headings = ("alternative", "setting", "won when it was chosen", "taken, seeds")
-    return Table(f"{compared.task}: settings that were tried", headings, rows) if rows else None
+    note = (
+        "The share of the winnable starts that each setting wins in the game, or of other starts under a "
+        "short attack: the best setting is taken."
+    )
+    title = f"{compared.task}: settings that were tried"
+    return Table(title, headings, rows, note) if rows else None
 
 
 def sentences(compared: Compared) -> Iterator[str]:

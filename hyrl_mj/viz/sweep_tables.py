@@ -1,11 +1,7 @@
-"""The results of a sweep as tables, for its page and the terminal.
-
-Only `summary` would be pandas' work: the rest is the text of each figure, and cells that hold no Markdown.
-"""
+"""The results of a sweep as tables, for its page and the terminal."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -101,7 +97,7 @@ def summary_table(sweep: Sweep) -> Table:
     for name in shown(sweep.rows):
         values = [[row.figures.get(name) for row in group] for group in done.values()]
         rows.append([COLUMNS[name].heading, *(_cell(COLUMNS[name], own) for own in values)])
-    title = "median over the seeds (least to greatest)"
+    title = "median over the seeds (least to greatest where they differ)"
     return Table(title, ["figure", *(setting.title for setting in groups)], rows)
 
 
@@ -124,7 +120,11 @@ def improvement_table(sweep: Sweep) -> Table | None:
         }
         rows.append(row)
     title = "HyRL against the RL policy: means, 95% intervals (bootstrap over seeds and starts)"
-    return Table.of(title, rows)
+    note = (
+        "Over the seeds and settings; there are intervals where a setting has at least three seeds. The "
+        "probability is that a run of HyRL is better than one of the policy."
+    )
+    return Table.of(title, rows, note)
 
 
 def _with_interval(mean: Mean, show: Callable[[float], str]) -> str:
@@ -164,17 +164,6 @@ def worst(group: Iterable[Row]) -> Row | None:
         ]
 
     return min((row for row in group if row.done), key=goodness, default=None)
-
-
-def markdown(table: Table) -> str:
-    """Returns a table to paste as Markdown."""
-    lines = [_escaped(table.headings), ["---"] * len(table.headings), *map(_escaped, table.rows)]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
-def _escaped(cells: Iterable[object]) -> list[str]:
-    """Returns cells that hold no Markdown: no column, no link and no element of HTML."""
-    return [re.sub(r"([\\|\[\]<>`])", r"\\\1", str(cell)) for cell in cells]
 
 
 def print_sweep(sweep: Sweep) -> None:

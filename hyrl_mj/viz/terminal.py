@@ -5,20 +5,12 @@ from __future__ import annotations
 from hyrl_mj.runs.directory import Run
 from hyrl_mj.simulation import LogNoise
 from hyrl_mj.viz.tables import (
-    NAMES,
     Table,
-    attack_table,
-    comparison_table,
-    episode_table,
     extent,
-    margin_table,
     noise_table,
     replay_sentence,
     replay_table,
-    replays_table,
-    score_table,
-    sensed_table,
-    signals_table,
+    robustness_tables,
 )
 
 
@@ -46,25 +38,9 @@ def print_verdict(run: Run) -> None:
 
 
 def print_robustness(run: Run) -> None:
-    """Prints the scores of the worst-case game and the counts of the noisy episodes."""
-    game, episodes = run.robustness.game, run.robustness.episodes
-    if game is not None:
-        print_table(score_table(run.task, game))
-        if not game.estimate:
-            print_table(margin_table(run.task, game))
-        if game.sensed:
-            print_table(sensed_table(run.task, game))
-        if game.replays:
-            print_table(replays_table(run.task, game.replays))
-        for who, why in game.why_not_proved.items():
-            print(f"{NAMES[who]} is not proved: {why}")
-    if episodes:
-        print_table(episode_table(run.task, episodes))
-    if attacks := run.robustness.attacks:
-        print_table(attack_table(run.task, attacks))
-        print_table(signals_table(run.task, attacks))
-    if comparisons := run.robustness.comparisons:
-        print_table(comparison_table(run.task, comparisons))
+    """Prints what noise can do."""
+    for table in robustness_tables(run.task, run.robustness):
+        print_table(table)
 
 
 def print_noise(noise: LogNoise) -> None:
@@ -93,9 +69,11 @@ def print_table(table: Table) -> None:
     wide = console.options.update(max_width=10_000)  # no table is wider
     if Measurement.get(console, wide, drawn).minimum <= console.width:
         console.print(drawn)
-        return
-    print(table.title)
-    for row in table.rows:
-        print()
-        for heading, cell in zip(table.headings, row, strict=True):
-            print(f"{heading}: {cell}")
+    else:
+        print(table.title)
+        for row in table.rows:
+            print()
+            for heading, cell in zip(table.headings, row, strict=True):
+                print(f"{heading}: {cell}")
+    for remark in table.remarks:
+        print(remark)

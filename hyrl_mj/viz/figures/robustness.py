@@ -152,8 +152,7 @@ def draw_robustness_curve(shown: ShownGame, path: Path | None = None) -> Figure:
             panels[1].set_ylabel("worst time to arrival,\nnodes that are won [s]")
         for panel in panels:
             panel.axvline(run_eps, color=colours.INK, linewidth=1, linestyle=(0, (1, 2)), zorder=1)
-            style.grid_lines(panel)
-            panel.spines[["top", "right"]].set_visible(False)
+            style.open_panel(panel)
         limits = (0, 1.01 * max(eps[-1], run_eps))
         panels[-1].set(xlabel=f"noise bound eps on {where} [{unit}]", xlim=limits)
         note = f"this run: eps = {run_eps:g} {unit}"
