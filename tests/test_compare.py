@@ -459,4 +459,4 @@ def test_an_alternative_that_wins_stands_first(three):
 
 def test_without_three_seeds_there_is_no_interval(three):
     few = replace(three, rows=tuple(r for r in three.rows if r.seed < 2))
-    assert few.difference("stack", "worst")[1] is None
+    assert few.difference("stack", "worst").interval is None

@@ -206,7 +206,7 @@ def test_where_nothing_could_be_compared_nothing_is_withstood():
 def test_runs_without_a_figure_are_counted():
     rows = [row(0, hyrl_margin=0.1), row(1, hyrl_margin=None), row(2, hyrl_margin=None)]
     (*_, cells) = sweep_tables.summary_table(Sweep(Common("fast", None, {}), tuple(rows))).rows
-    assert cells == ["HyRL, margin", "0.1, none in 2 of 3 runs"]
+    assert cells == ["HyRL margin", "0.1, none in 2 of 3 runs"]
 
 
 def test_without_ray_one_sentence_says_how_to_install_it(tmp_path):

@@ -94,19 +94,19 @@ def _improvement(figure: str, more: bool, groups: Sequence[np.ndarray]) -> Impro
     for runs in groups:
         apart = (runs[None, :, 1] - runs[:, None, 0]) * (1 if more else -1)
         better.append(float(np.mean((apart > 0) + (apart == 0) / 2)))
-    policy, hyrl, difference = (_mean(groups, np.array(by)) for by in ((1, 0), (0, 1), (-1, 1)))
+    policy, hyrl, difference = (mean(groups, np.array(by)) for by in ((1, 0), (0, 1), (-1, 1)))
     return Improvement(
         figure, sum(map(len, groups)), policy, hyrl, difference, float(np.mean(better))
     )
 
 
-def _mean(groups: Sequence[np.ndarray], by: np.ndarray) -> Mean:
+def mean(groups: Sequence[np.ndarray], by: np.ndarray) -> Mean:
     """Returns the mean of both values of each run (seeds, 3), times `by` (2,), with its interval."""
     from scipy.stats import bootstrap  # slow to import, and seldom needed
 
     rng = np.random.default_rng(0)
 
-    def mean(*chosen: np.ndarray, axis: int = -1) -> np.ndarray:
+    def of_drawn(*chosen: np.ndarray, axis: int = -1) -> np.ndarray:
         means = []
         for runs, numbers in zip(groups, chosen, strict=True):
             drawn = runs[numbers.astype(int)]
@@ -122,7 +122,7 @@ def _mean(groups: Sequence[np.ndarray], by: np.ndarray) -> Mean:
         return Mean(whole, None)
     found = bootstrap(
         [np.arange(len(runs)) for runs in groups],
-        mean,
+        of_drawn,
         n_resamples=9_999,
         method="percentile",
         vectorized=True,

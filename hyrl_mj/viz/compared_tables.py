@@ -99,14 +99,14 @@ def sentences(compared: Compared) -> Iterator[str]:
         best = others[0]
         title = compared.of(best)[0].title
         wins, hyrl = (f"{100 * _middle(compared, n, 'worst'):.2f}%" for n in (best, "hyrl"))
-        value, interval = compared.difference(best, "worst")
-        between = ""
-        if interval is not None:
-            low, high = (f"{100 * end:+.2f}" for end in interval)
+        mean, between = compared.difference(best, "worst"), ""
+        if mean.interval is not None and np.ptp(mean.interval):
+            low, high = (f"{100 * end:+.2f}" for end in mean.interval)
             between = f" (95% interval {low} to {high})"
-        word = "as many" if not value else f"{100 * abs(value):.2f} percentage points "
-        if value:
-            word += "more" if value > 0 else "less"
+        word = "as many"
+        if mean.value:
+            more = "more" if mean.value > 0 else "less"
+            word = f"{100 * abs(mean.value):.2f} percentage points {more}"
         yield (
             f"The best alternative is {title}, which wins from {wins} of the starts under attack; HyRL wins "
             f"from {hyrl}, {word}{between}."

@@ -104,7 +104,9 @@ def draw_profiles(sweep: Sweep) -> Figure | None:
                 ("hyrl", "HyRL", colours.MODES[0]),
             ):
                 panel.plot(100 * thresholds, 100 * shares[who], color=colour, label=label)
-            panel.set(xlim=(0, 100), ylim=(0, 102), xlabel=f"{tables.FIGURES[name][0]} [%]")
+            panel.set(
+                xlim=(0, 100), ylim=(0, 102), xlabel=f"{''.join(tables.FIGURES[name][:2])} [%]"
+            )
         panels[0].set_ylabel("runs with at least so much [%]")
     return figure
 
