@@ -363,7 +363,6 @@ def test_a_file_makes_an_alternative_which_may_not_fit(mistake, result, folder, 
     @register
     class Never(Alternative):
         name, title = f"never-{type(mistake).__name__}", "never"
-        sentence = "It fits nothing."
 
         def candidates(self, given):
             yield Candidate("first", given.run.controllers["policy"])

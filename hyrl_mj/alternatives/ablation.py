@@ -14,11 +14,10 @@ from hyrl_mj.stages import ExtendedSets, HeldInputs, Partition, part_policy, tab
 
 @register
 class HysteresisAlone(Alternative):
-    """HyRL without stage 6."""
+    """HyRL's sets; each mode continues what the policy of stage 1 decides on its part."""
 
     name = "hysteresis"
     title = "hysteresis alone"
-    sentence = "HyRL's sets; each mode continues what the policy of stage 1 decides on its part."
 
     def candidates(self, given: Given) -> Iterator[Candidate]:
         run, task = given.run, given.task
@@ -47,11 +46,10 @@ def one_mode(given: Given) -> tuple[ExtendedSets, Partition]:
 
 @register
 class RetrainingAlone(Alternative):
-    """HyRL without modes."""
+    """One policy for all of the chart, trained as stage 6 trains those of modes, without a switch."""
 
     name = "retraining"
     title = "stage 6 alone"
-    sentence = "One policy for all of the chart, trained as stage 6 trains those of modes, without a switch."
 
     def candidates(self, given: Given) -> Iterator[Candidate]:
         from hyrl_mj.stages.grounds import mode_ground
@@ -69,13 +67,10 @@ class RetrainingAlone(Alternative):
 
 @register
 class TableAlone(Alternative):
-    """A table without modes."""
+    """One table of inputs for all of the chart, made as those of modes that stage 6 may make."""
 
     name = "table"
     title = "table without modes"
-    sentence = (
-        "One table of inputs for all of the chart, made as those of modes that stage 6 may make."
-    )
 
     def candidates(self, given: Given) -> Iterator[Candidate]:
         sets, _ = one_mode(given)

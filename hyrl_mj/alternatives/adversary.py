@@ -22,14 +22,11 @@ from hyrl_mj.tasks import Task
 
 @register
 class TrainedAgainstAdversary(Alternative):
-    """Training by turns with an adversary."""
+    """Policy and an adversary who adds the noise learn by turns (ATLA, Zhang et al. 2021,
+    arXiv:2101.08452)."""
 
     name = "adversary"
     title = "trained against an adversary"
-    sentence = (
-        "Policy and an adversary who adds the noise learn by turns (ATLA, Zhang et al. 2021, "
-        "arXiv:2101.08452)."
-    )
 
     def candidates(self, given: Given) -> Iterator[Candidate]:
         for turns in (2, 4):

@@ -111,12 +111,10 @@ class Alternative(ABC):
     Attributes:
         name: as in `hyrl-mj compare --only NAME`.
         title: as in tables.
-        sentence: how it works, in a sentence.
     """
 
     name: str
     title: str
-    sentence: str
 
     @abstractmethod
     def candidates(self, given: Given) -> Iterator[Candidate]:

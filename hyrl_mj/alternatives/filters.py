@@ -93,11 +93,10 @@ class KalmanFilter:
 
 @register
 class Filtered(Alternative):
-    """Filtered measurements."""
+    """A moving average, or a Kalman filter on the task's own plant, before the policy of stage 1."""
 
     name = "filtered"
     title = "filtered"
-    sentence = "A moving average, or a Kalman filter on the task's own plant, before the policy of stage 1."
 
     def candidates(self, given: Given) -> Iterator[Candidate]:
         task, policy = given.task, given.run.steady

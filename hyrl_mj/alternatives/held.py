@@ -78,11 +78,10 @@ class HeldInputs:
 
 @register
 class Held(Alternative):
-    """Decisions that are held."""
+    """Each input of the policy of stage 1 is applied for several samples."""
 
     name = "held"
     title = "inputs held"
-    sentence = "Each input of the policy of stage 1 is applied for several samples."
 
     def candidates(self, given: Given) -> Iterator[Candidate]:
         task, policy = given.task, given.run.steady

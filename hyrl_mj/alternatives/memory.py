@@ -15,11 +15,10 @@ from hyrl_mj.policies import PolicyController, PreprocessedPolicy, Preprocessing
 
 @register
 class FrameStack(Alternative):
-    """The last observations."""
+    """PPO on the last 4 observations, trained under uniform noise."""
 
     name = "stack"
     title = "frame stack"
-    sentence = "PPO on the last 4 observations, trained under uniform noise."
 
     def candidates(self, given: Given) -> Iterator[Candidate]:
         length = 4
@@ -35,11 +34,10 @@ class FrameStack(Alternative):
 
 @register
 class Recurrent(Alternative):
-    """A recurrent network."""
+    """RecurrentPPO (an LSTM of 64 cells), trained under uniform noise."""
 
     name = "recurrent"
     title = "recurrent"
-    sentence = "RecurrentPPO (an LSTM of 64 cells), trained under uniform noise."
 
     def candidates(self, given: Given) -> Iterator[Candidate]:
         try:

@@ -25,11 +25,10 @@ class NoisyGround(TaskGround):
 
 @register
 class TrainedUnderNoise(Alternative):
-    """Training under noise."""
+    """The policy of stage 1, trained under uniform, alternating or constant noise."""
 
     name = "noise"
     title = "trained under noise"
-    sentence = "The policy of stage 1, trained under uniform, alternating or constant noise."
 
     def candidates(self, given: Given) -> Iterator[Candidate]:
         settings = given.training()

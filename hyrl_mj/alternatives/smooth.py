@@ -71,11 +71,10 @@ class SmoothPolicy(ActorCriticPolicy):
 
 @register
 class Smooth(Alternative):
-    """Smooth policies."""
+    """PPO with a penalty for changes of the input, by CAPS or of the policy's slope."""
 
     name = "smooth"
     title = "smooth (CAPS, Lipschitz)"
-    sentence = "PPO with a penalty for changes of the input, by CAPS or of the policy's slope."
 
     def candidates(self, given: Given) -> Iterator[Candidate]:
         task = given.task
