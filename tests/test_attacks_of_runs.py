@@ -19,8 +19,7 @@ from hyrl_mj.tasks import SPARING
 from hyrl_mj.viz.commands import commands
 from hyrl_mj.viz.report import render
 from hyrl_mj.viz.shows import replay_shows
-from hyrl_mj.viz.tables import attack_table, comparison_table, robustness_sentence
-from hyrl_mj.viz.terminal import print_robustness
+from hyrl_mj.viz.tables import attack_table, comparison_table, print_robustness, robustness_sentence
 
 FEW = {"episodes": 20, "noise": ("none", "uniform")}
 

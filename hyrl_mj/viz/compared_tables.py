@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
 from hyrl_mj.judging.game import percent
 from hyrl_mj.runs.compared import Compared, Row
-from hyrl_mj.viz.tables import Table
-from hyrl_mj.viz.terminal import print_table
+from hyrl_mj.viz.tables import Table, print_table, spread
 
 # The figures in the table, with the headings of their columns and whether they are shares.
 COLUMNS = {
@@ -68,9 +68,8 @@ def _cell(values: list[float], share: bool) -> str:
     """Returns the mean of values, and their range if they differ."""
     if not values:
         return "-"
-    show = (lambda v: percent(v, surely=False)) if share else "{:.3g}".format
-    text, ends = show(float(np.mean(values))), (show(min(values)), show(max(values)))
-    return text if ends[0] == ends[1] else f"{text} ({ends[0]} to {ends[1]})"
+    show = partial(percent, surely=False) if share else "{:.3g}".format
+    return spread(float(np.mean(values)), (min(values), max(values)), show)
 
 
 def tried_table(compared: Compared) -> Table | None:

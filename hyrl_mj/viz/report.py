@@ -83,7 +83,7 @@ def render(run: Run) -> str:
         verdict=run.verdict if robustness and all(map(has, facts)) else None,
         against_noise=against_noise(run, robustness),
         replays=arcs and tables.replay_table(run, arcs),
-        stages=_stages(run, robustness, arcs),
+        stages=_stages(run),
         table=_texts(vars(s), {"eps": unit, "horizon": "s"}),
         training=[(name, first.get(name, ""), sixth.get(name, "")) for name in first | sixth],
         commands=commands(run, robustness),
@@ -130,10 +130,8 @@ def capital(sentence: str) -> str:
 # ---- stages and settings
 
 
-def _stages(
-    run: Run, robustness: Robustness | None, arcs: tables.Arcs | None
-) -> list[tuple[str, str]]:
-    """Returns the result of each stage in a sentence."""
+def _stages(run: Run) -> list[tuple[str, str]]:
+    """Returns the results of the stages that make the controller in a sentence each."""
     task, s, modes = run.task, run.settings, run.extended_sets.modes
     reach = "; ".join(f"mode {task.mode_name(q)}: {tables.extent(run, q)}" for q in modes)
     attempts = f"up to {s.stage6.attempts} times " if s.stage6.attempts > 1 else ""
@@ -155,11 +153,6 @@ def _stages(
         ("partition", run.partition.sentence(task, run.settings.ways)),
         ("extended-sets", f"{run.extended_sets.sentence(task)}; {reach}"),
         ("retrain", retrained),
-        (
-            "robustness",
-            "not done" if robustness is None else tables.robustness_sentence(robustness),
-        ),
-        ("simulate", "not done" if arcs is None else tables.replay_sentence(run, arcs)),
     ]
 
 

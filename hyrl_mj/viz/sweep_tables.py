@@ -6,13 +6,14 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
+import numpy as np
+
 from hyrl_mj.errors import counted
 from hyrl_mj.judging.game import percent
 from hyrl_mj.runs.improvement import COMPARED, Mean, improvements
-from hyrl_mj.runs.sweeps import Row, Sweep, summary
+from hyrl_mj.runs.sweeps import Row, Sweep
 from hyrl_mj.simulation import KINDS
-from hyrl_mj.viz.tables import NAMES, Table
-from hyrl_mj.viz.terminal import print_table
+from hyrl_mj.viz.tables import NAMES, Table, print_table, spread
 
 
 @dataclass(frozen=True)
@@ -174,9 +175,9 @@ def print_sweep(sweep: Sweep) -> None:
 
 def _cell(column: Column, values: Sequence[float | None]) -> str:
     """Returns median, least and greatest of some figures, and of how many runs there is none."""
-    if (three := summary(values)) is None:
+    known = [value for value in values if value is not None]
+    if not known:
         return "-"
-    median, *ends = map(column.show, three)
-    text = median if ends[0] == ends[1] else f"{median} ({' to '.join(ends)})"
-    missing = sum(value is None for value in values)
+    text = spread(float(np.median(known)), (min(known), max(known)), column.show)
+    missing = len(values) - len(known)
     return f"{text}, none in {missing} of {counted(len(values), 'run')}" if missing else text

@@ -1,9 +1,9 @@
-"""The results of a run as tables and sentences, for the report and the terminal."""
+"""The results of a run as tables and sentences, for pages and the terminal."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -73,6 +73,12 @@ def markdown(table: Table) -> str:
 def _escaped(cells: Iterable[object]) -> list[str]:
     """Returns cells that hold no Markdown: no column, no link and no element of HTML."""
     return [re.sub(r"([\\|\[\]<>`])", r"\\\1", str(cell)) for cell in cells]
+
+
+def spread(middle: float, ends: Iterable[float], show: Callable[[float], str]) -> str:
+    """Returns a middle value with the least and the greatest, if these differ: "3 (1 to 4)"."""
+    low, high = map(show, ends)
+    return show(middle) if low == high else f"{show(middle)} ({low} to {high})"
 
 
 Arcs = Mapping[tuple[str, str], HybridArc]
@@ -367,13 +373,6 @@ def _both(values: Mapping[str, int | tuple[float, float]]) -> str:
     return ("; " if any(isinstance(v, tuple) for v in values.values()) else ", ").join(texts)
 
 
-def attack_sentence(counts: Sequence[AttackCount]) -> str:
-    """Returns what the attack breaks in one line."""
-    return "the attack breaks " + ", ".join(
-        f"{NAMES[c.controller]} from {c.broken}" for c in counts
-    )
-
-
 def robustness_sentence(robustness: Robustness) -> str:
     """Returns the most important scores in one line."""
     if robustness.deciding is None:
@@ -383,7 +382,8 @@ def robustness_sentence(robustness: Robustness) -> str:
             share = "all" if least == 1 else f"{percent(least)} or more of the"
             parts.append(f"{NAMES[who]} reaches in {share} episodes")
         if robustness.attacks:
-            parts.append(attack_sentence(robustness.attacks))
+            broken = (f"{NAMES[c.controller]} from {c.broken}" for c in robustness.attacks)
+            parts.append(f"the attack breaks {', '.join(broken)}")
         return ", ".join(parts)
     policy, hyrl = (robustness.deciding.scores[who][-1] for who in ("policy", "hyrl"))
     shares = [
@@ -450,3 +450,71 @@ def extent(run: Run, mode: int) -> str:
 def _point(z: np.ndarray) -> str:
     """Returns a chart point (d,), to a thousandth."""
     return f"({', '.join(f'{v + 0.0:.3f}' for v in np.round(z, 3))})"
+
+
+# ---- what commands print
+
+
+def print_summary(run: Run) -> None:
+    """Prints the verdict, and the results of policy and hybrid controller in replays and worst case."""
+    arcs = run.arcs()
+    print_verdict(run)
+    print_table(replay_table(run, arcs))
+    print(run.critical_set.sentence(run.task))
+    for q in run.extended_sets.modes:
+        print(f"mode {run.task.mode_name(q)}: {extent(run, q)}")
+    print(replay_sentence(run, arcs))
+    print_robustness(run)
+    print(f"run directory {run.path}")
+    for what, name in (("video", "replay.mp4"), ("report", "report.html")):
+        path = run.path / name
+        print(f"{what} {path}" if run.manifest.has(path) else f"no {what}")
+
+
+def print_verdict(run: Run) -> None:
+    """Prints the verdict with its reasons."""
+    print(run.verdict)
+    for reason in run.verdict.reasons:
+        print(f"- {reason}")
+
+
+def print_robustness(run: Run) -> None:
+    """Prints what noise can do."""
+    for table in robustness_tables(run.task, run.robustness):
+        print_table(table)
+
+
+def print_noise(noise: LogNoise) -> None:
+    """Prints the noise of a log: a table, what it does not tell, and the noise to give to a run."""
+    print_table(noise_table(noise))
+    for remark in (*noise.remarks, *(text for column in noise.columns for text in column.remarks)):
+        print(f"- {remark}")
+    if len({column.text for column in noise.columns}) > 1:
+        for column in noise.columns:
+            print(f"{column.name}: {column.text}")
+    print(f'hyrl-mj run TASK --noise "{noise.text}"')
+
+
+def print_table(table: Table) -> None:
+    """Prints a table, every cell whole; on a terminal too narrow for its words, a line for each cell."""
+    import rich.table  # slow to import, and --help does not need it
+    from rich.console import Console
+    from rich.measure import Measurement
+
+    drawn = rich.table.Table(*table.headings, title=table.title)
+    for row in table.rows:
+        drawn.add_row(*map(str, row))
+    # Off a terminal rich assumes 80 columns, which would cut the cells.
+    width = None if Console().is_terminal else 160
+    console = Console(width=width, markup=False, emoji=False, highlight=False)
+    wide = console.options.update(max_width=10_000)  # no table is wider
+    if Measurement.get(console, wide, drawn).minimum <= console.width:
+        console.print(drawn)
+    else:
+        print(table.title)
+        for row in table.rows:
+            print()
+            for heading, cell in zip(table.headings, row, strict=True):
+                print(f"{heading}: {cell}")
+    for remark in table.remarks:
+        print(remark)
