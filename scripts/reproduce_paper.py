@@ -77,7 +77,7 @@ def draw(circle: hyrl_mj.Run, vehicle: hyrl_mj.Run, folder: Path) -> None:
     for run in (circle, vehicle):
         shown = figures.shown_run(run)
         for name, file in PAPER[run.task.name].items():
-            figures.FIGURES[name].draw(shown, folder / f"{file}.png")
+            figures.style.write(figures.FIGURES[name].draw(shown), folder / f"{file}.png")
 
 
 # ---- our values

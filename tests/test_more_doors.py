@@ -204,8 +204,9 @@ def test_options_are_shown_without_docstrings():  # as under PYTHONOPTIMIZE=2
 
 
 def test_a_name_is_no_formula(tmp_path, circle):
-    with style.drawing(tmp_path / "a.png", 3.0, circle, "$\\frac{$") as figure:
+    with style.drawing(3.0, circle, "$\\frac{$") as figure:
         figure.subplots().set_xlabel("$$")
+    style.write(figure, tmp_path / "a.png")
     assert (tmp_path / "a.pdf").exists()
 
 
@@ -358,12 +359,11 @@ def test_a_figure_on_a_full_disk_is_one_sentence(tmp_path, monkeypatch, circle):
     monkeypatch.setattr(style, "DPI", 5)
 
     def work():
-        with style.drawing(Path("a.png"), 3.0, circle, "title"):
-            pass
+        with style.drawing(3.0, circle, "title") as figure:
+            style.write(figure, Path("a.png"))
         room = (Path("a.png").stat().st_size + Path("a.pdf").stat().st_size) // 2
         resource.setrlimit(resource.RLIMIT_FSIZE, (room, room))  # the PNG is the smaller one
-        with style.drawing(Path("b.png"), 3.0, circle, "title"):
-            pass
+        style.write(figure, Path("b.png"))
 
     answer = child(work, tmp_path)
     assert answer.err.splitlines()[-1].startswith(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -159,7 +158,7 @@ def hybrid_way(panel: Axes, task: Task, view: View, arc: HybridArc, modes: Seque
         mark(panel, view, arc, row, "D", color=INK, markersize=3.5, zorder=7, label="jump")
 
 
-def draw_runs(shown: ShownRun, path: Path | None = None) -> Figure:
+def draw_runs(shown: ShownRun) -> Figure:
     """Draws the hybrid controller and the policy under the same noise, a column for each start mode.
 
     Of a chart with two coordinates the paths are shown in its plane, at most four beside each other; else
@@ -176,7 +175,7 @@ def draw_runs(shown: ShownRun, path: Path | None = None) -> Figure:
     noise = style.noise_label(task, first.noise, first.bound)
     title = f"HyRL and {policy_title}\nunder the same {noise}"
     thin = {"color": POLICY, "linewidth": 1.0, "zorder": 4}
-    with style.drawing(path, 1.6 + 3.4 * rows, task, title) as figure:
+    with style.drawing(1.6 + 3.4 * rows, task, title) as figure:
         panels = figure.subplots(rows, columns, sharex=True, sharey="row", squeeze=False)
         for (row, column), panel in np.ndenumerate(panels):
             coordinate, loop = (0, row * columns + column) if plane else (row, column)
