@@ -24,6 +24,7 @@ __all__ = [
     "drives",
     "encoding",
     "figures",
+    "pages",
     "print_compared",
     "print_noise",
     "print_robustness",
