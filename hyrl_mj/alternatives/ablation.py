@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from hyrl_mj.alternatives.base import Alternative, Candidate, Given, Unfit, register
-from hyrl_mj.policies import HybridController, PolicyController
+from hyrl_mj.policies import HybridController
 from hyrl_mj.sets import GridSet
 from hyrl_mj.stages import ExtendedSets, HeldInputs, Partition, part_policy, table_for
 
@@ -62,7 +62,7 @@ class RetrainingAlone(Alternative):
         ground = mode_ground(task, sets, 0, parts, given.run.steady, False, s.modes, s.attack)
         policy, result = retrain(ground, s.stage6, given.seed)
         samples = result.attempts * s.stage6.samples
-        yield Candidate("all of the chart", PolicyController(policy), samples)
+        yield Candidate("all of the chart", policy, samples)
 
 
 @register
@@ -80,4 +80,4 @@ class TableAlone(Alternative):
                 "a table takes a chart of at most two dimensions, few inputs, and an arrival that ends the "
                 "episode"
             )
-        yield Candidate("all of the chart", PolicyController(table_for(held, 0)))
+        yield Candidate("all of the chart", table_for(held, 0))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hyrl_mj.alternatives.base import Alternative, Candidate, Given, register
-from hyrl_mj.policies import Controller, Policy, PolicyController
+from hyrl_mj.policies import Policy
 from hyrl_mj.tasks import Task
 
 
@@ -85,10 +85,6 @@ class Held(Alternative):
 
     def candidates(self, given: Given) -> Iterator[Candidate]:
         task, policy = given.task, given.run.steady
+        held = HeldInputs if task.input_levels is None else HeldLevels
         for samples in (2, 3, 5, 8):
-            held: Controller
-            if task.input_levels is None:
-                held = PolicyController(HeldInputs(task, policy, samples))
-            else:
-                held = HeldLevels(task, policy, samples)
-            yield Candidate(f"{samples} samples", held)
+            yield Candidate(f"{samples} samples", held(task, policy, samples))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 from stable_baselines3.common.vec_env import VecFrameStack
@@ -10,7 +11,7 @@ from stable_baselines3.common.vec_env import VecFrameStack
 from hyrl_mj.alternatives.base import Alternative, Candidate, Given, Unfit, register
 from hyrl_mj.alternatives.training import environment, learned
 from hyrl_mj.learning.training import export
-from hyrl_mj.policies import PolicyController, PreprocessedPolicy, Preprocessing, from_callable
+from hyrl_mj.policies import PreprocessedPolicy, Preprocessing, from_callable
 
 
 @register
@@ -23,13 +24,13 @@ class FrameStack(Alternative):
     def candidates(self, given: Given) -> Iterator[Candidate]:
         length = 4
 
-        def controller(model: Any) -> PolicyController:
+        def policy(model: Any) -> PreprocessedPolicy:
             network = export(model, given.task, length)
-            return PolicyController(PreprocessedPolicy(network, Preprocessing(n_stack=length)))
+            return PreprocessedPolicy(network, Preprocessing(n_stack=length))
 
         env = VecFrameStack(environment(given, "uniform"), length)
-        model = learned(given, env, controller)
-        yield Candidate(f"{length} observations", controller(model), given.samples)
+        model = learned(given, env, policy)
+        yield Candidate(f"{length} observations", policy(model), given.samples)
 
 
 @register
@@ -45,17 +46,14 @@ class Recurrent(Alternative):
         except ImportError:
             raise Unfit("sb3-contrib is missing: pip install sb3-contrib") from None
 
-        def controller(model: Any) -> PolicyController:
-            return PolicyController(from_callable(model, given.task))
-
         hidden = given.training("ppo").hidden
         model = learned(
             given,
             environment(given, "uniform"),
-            controller,
+            partial(from_callable, task=given.task),
             policy="MlpLstmPolicy",
             algorithm=RecurrentPPO,
             net_arch=list(hidden[:1]),
             lstm_hidden_size=64,
         )
-        yield Candidate("64 cells", controller(model), given.samples)
+        yield Candidate("64 cells", from_callable(model, given.task), given.samples)
