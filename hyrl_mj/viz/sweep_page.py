@@ -32,15 +32,14 @@ def write_page(sweep: Sweep, folder: Path) -> None:
         sections.append(("Runs that are not done", [left]))
     sections.append(("The runs", [*_runs(sweep)]))
     common, name = sweep.common, pages.name_of(folder)
-    of = {"preset": f" {common.preset}"}
-    if common.horizon is not None:
-        of["horizon"] = f" {common.horizon} s"
-    of |= {setting: f" = {value}" for setting, value in common.set.items()}
+    of = [f"preset {common.preset}"]
+    of += [] if common.horizon is None else [f"horizon {common.horizon} s"]
+    of += [f"{setting} = {value}" for setting, value in common.set.items()]
     page = pages.fill(
         heading=f"Hysteresis-Based RL, sweep {name}",
         title=f"Sweep {name}",
         subtitle=f"{sum(row.done for row in sweep.rows)} of {len(sweep.rows)} runs are done, "
-        f"{', '.join(map(''.join, of.items()))}.",
+        f"{', '.join(of)}.",
         sections=[*sections, pages.to_paste(summary)],
     )
     pages.write(folder / "sweep.html", page)

@@ -44,19 +44,14 @@ def plane_view(panel: Axes, section: Section) -> View:
     return View(lambda t, z: chart.wrap(z[..., :2]), longest)
 
 
-def time_view(panel: Axes, chart: Chart, coordinate: int) -> View:
-    """Makes a panel a coordinate over time."""
-    panel.set_xlabel("time [s]")
-    charts.label_axis(panel.yaxis, chart, coordinate)
-    style.grid_lines(panel)
-    return View(lambda t, z: np.stack([t, z[:, coordinate]], axis=1))
-
-
 def view_of(panel: Axes, section: Section, coordinate: int, flat: bool) -> View:
     """Makes a panel the plane of a section, or not `flat` a coordinate of the whole chart over time."""
     if flat:
         return plane_view(panel, section)
-    return time_view(panel, section.task.chart, coordinate)
+    panel.set_xlabel("time [s]")
+    charts.label_axis(panel.yaxis, section.task.chart, coordinate)
+    style.grid_lines(panel)
+    return View(lambda t, z: np.stack([t, z[:, coordinate]], axis=1))
 
 
 def spiral_view(chart: Chart, horizon: float) -> View:
