@@ -3,7 +3,6 @@
     python scripts/benchmark.py              # median, least and greatest ratio of 5 pairs each
     python scripts/benchmark.py --quick      # one pair each of what takes seconds, on runs of preset smoke
     python scripts/benchmark.py --only replay engine --json benchmark.json
-    python scripts/benchmark.py --only control --growth growth.png
 
 It measures and asserts nothing. Leave the machine alone while it runs.
 """
@@ -21,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from benchmarks import Figure, control, engine, growth, learning, replay, runs, stages
+from benchmarks import Figure, control, engine, learning, replay, runs, stages
 from rich.console import Console
 from rich.table import Table
 
@@ -70,7 +69,6 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=GROUPS, default=list(GROUPS))
     parser.add_argument("--runs", type=Path, help="keep the finished runs here, for the next time")
     parser.add_argument("--json", type=Path, help="also write the results here")
-    parser.add_argument("--growth", type=Path, help="draw time and memory against size here")
     options = parser.parse_args()
     results = []
     with tempfile.TemporaryDirectory() as folder:
@@ -82,8 +80,6 @@ def main() -> None:
                     continue
                 print(f"{figure.name} ...", file=sys.stderr, flush=True)
                 results.append(figure.measure(1 if options.quick else PAIRS))
-        if options.growth:
-            growth.plot(made.path("vehicle"), options.growth)
     Console(width=None if sys.stdout.isatty() else 200).print(table(results))
     if options.json:
         content = {"machine": machine(), "figures": results}

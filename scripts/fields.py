@@ -2,19 +2,17 @@
 
     hyrl-mj run field --seed 0 --out runs/field-0
     python scripts/fields.py published runs/field-0 fields.json
-    python scripts/fields.py random runs/field-0 --fields 1000
-    python scripts/fields.py random runs/field-0 --fields 300 --moving
-    python scripts/fields.py rows runs/field-0 --fields 99 --starts 4
-    python scripts/fields.py rows runs/field-0 --fields 200 --starts 3 --posts 9 --moving
+    python scripts/fields.py random runs/field-0 --fields 99 --starts 4
+    python scripts/fields.py random runs/field-0 --fields 200 --starts 3 --posts 9 --moving
     python scripts/fields.py many runs/field-0
 
-`published` takes layouts in the format of the published work (HybridSystemsLab/MultiHyRL), `random` draws
-fields of 3 to 12 posts, and `many` times 1,000 fields of 12 posts.
+`published` takes layouts in the format of the published work (HybridSystemsLab/MultiHyRL), and `many` times
+1,000 fields of 12 posts.
 
-`rows` asks what does the work: a controller has the memory of focus and side or not, the guard or not, and in
-its modes what was trained, a law that drives along the way, or random inputs. Half of its starts are on M*.
-Time and way are those of runs that arrive; late is what takes more than twice the time of the same controller
-without noise.
+`random` draws fields, and asks what does the work: a controller has the memory of focus and side or not, the
+guard or not, and in its modes what was trained, a law that drives along the way, or random inputs. Half of
+its starts are on M*. Time and way are those of runs that arrive; late is what takes more than twice the time
+of the same controller without noise.
 """
 
 from __future__ import annotations
@@ -22,7 +20,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -53,71 +51,94 @@ BATCH = 2_000
 
 
 @dataclass
-class Tally:
-    """What happened in some runs: a value for each.
+class Row:
+    """What became of the runs of one controller.
 
     Attributes:
-        outcomes: their labels.
-        times, ways: how long [s] and how far [m] they go.
+        outcomes: a label for each run.
+        times, ways, quiet: how long [s] and how far [m] they go, and how long without noise [s].
         changes, passed: numbers of changes of (q, lambda), and of posts passed; none without a memory.
+        lost: whether the attack makes a start be lost that is won without noise.
+        guard: the samples that the guard has seen, and those that it has changed.
     """
 
     outcomes: list[str] = field(default_factory=list)
     times: list[float] = field(default_factory=list)
     ways: list[float] = field(default_factory=list)
+    quiet: list[float] = field(default_factory=list)
     changes: list[int] = field(default_factory=list)
     passed: list[int] = field(default_factory=list)
+    lost: list[bool] = field(default_factory=list)
+    guard: Counter[str] = field(default_factory=Counter)
 
-    def cells(self, *labels: str) -> list[str]:
-        """Returns the number of runs, and of those with each label."""
-        return [f"{n:,}" for n in (len(self.outcomes), *map(self.outcomes.count, labels))]
+    def cells(self) -> list[str]:
+        arrived = np.array(self.outcomes) == "reached"
+        times, ways, quiet, changes = map(
+            np.array, (self.times, self.ways, self.quiet, self.changes)
+        )
+        spread = [
+            np.percentile(x[arrived], (50, 99)) if arrived.any() else (np.nan, np.nan)
+            for x in (times, ways)
+        ]
+        beyond = changes - np.array(self.passed) - 1
+        counts = len(arrived), *map(self.outcomes.count, ("reached", "crashed"))
+        return [
+            *(f"{n:,}" for n in counts), f"{(arrived & (times > LATE * quiet)).sum()}",
+            *("{:.1f}, {:.1f}".format(*pair) for pair in spread),
+            f"{self.guard['changed'] / self.guard['seen']:.0%}" if self.guard else "",
+            f"{np.median(changes):.0f}, {np.percentile(changes, 99):.0f}" if len(changes) else "",
+            f"{np.median(beyond):.0f}, {(beyond > 0).mean():.0%}" if len(changes) else "",
+            f"{sum(self.lost):,} of {len(self.lost):,}" if self.lost else "",
+        ]  # fmt: skip
 
-    def row(self) -> list[str]:
-        cells = self.cells("crashed", "stalled")
-        if not self.changes:
-            return [*cells, "", ""]
-        most = np.array(self.passed) + 1
-        few, twice = (np.array(self.changes) <= n * most for n in (1, 2))
-        return [*cells, f"{np.median(self.changes):.0f} ({few.mean():.1%})", f"{twice.mean():.2%}"]
+
+HEADINGS = (
+    "runs", "arrives", "crashes", "late", "time, s: median, 99%", "way, m: median, 99%",
+    "changed by the guard", "changes: median, 99%", "beyond posts passed + 1: median, share",
+    "attack: lost",
+)  # fmt: skip
 
 
 def drive(
-    task: Driving,
-    loop: Controller,
-    z0: np.ndarray,
-    noise: AnyNoise | None,
-    tally: Tally,
-    seed: int = 0,
+    task: Driving, loop: Controller, z0: np.ndarray, noise: AnyNoise, row: Row, seed: int = 0
 ) -> None:
-    """Runs a controller from starts, and counts."""
-    for first in range(0, len(z0), BATCH):
-        part = z0[first : first + BATCH]
-        settings = LoopSettings(record=True, quiet=True)
+    """Runs a controller from starts, without noise and with it, and counts."""
+    settings = LoopSettings(record=True, quiet=True)
+    parts = np.split(z0, range(BATCH, len(z0), BATCH))
+    for part in parts:
+        run = closed_loop(task, loop, part, None, seed=seed, settings=settings)
+        row.quiet += (run.length * task.dt).tolist()
+    if isinstance(loop, Parts):
+        loop.guard.count.clear()
+    for part in parts:
         run = closed_loop(task, loop, part, noise, seed=seed, settings=settings)
-        tally.outcomes += [Outcome(value).label for value in run.outcome]
-        tally.times += (run.length * task.dt).tolist()
+        row.outcomes += [Outcome(value).label for value in run.outcome]
+        row.times += (run.length * task.dt).tolist()
         moves = np.linalg.norm(np.diff(run.path[..., :2], axis=0), axis=2)
         during = np.arange(len(moves))[:, None] < run.length
-        tally.ways += (moves * during).sum(axis=0).tolist()
+        row.ways += (moves * during).sum(axis=0).tolist()
         if len(loop.modes) > 1:
-            count_changes(task, part, run, tally)
+            count_changes(task, part, run, row)
+    if isinstance(loop, Parts):
+        row.guard += loop.guard.count
 
 
 def drive_attacked(
-    task: Driving, who: str, loop: Controller, z0: np.ndarray, rounds: int, tally: Tally
+    task: Driving, loops: Mapping[str, Controller], z0: np.ndarray, given: argparse.Namespace, rows
 ) -> None:
-    """Runs a controller from starts under the worst noise that so many rounds find, and counts."""
-    found = attack(task, {who: loop}, z0, 0.1, Budget(rounds=rounds))[who]
-    tally.outcomes += [arc.outcome for arc in found.arcs]
+    """Searches for noise that makes controllers lose, and counts in their rows by name."""
+    budget = Budget(rounds=given.rounds)
+    for name, found in attack(task, loops, z0, 0.1, budget, seed=given.seed).items():
+        rows[name].lost += (found.ends.lost & ~found.quiet.lost).tolist()
 
 
-def count_changes(task: Driving, z0: np.ndarray, run, tally: Tally) -> None:
+def count_changes(task: Driving, z0: np.ndarray, run, row: Row) -> None:
     """Counts changes of focus and side, and the posts that were in focus when they were passed."""
     q, length = np.array(run.q), run.length
     focus, side, _ = decoded(q)
     pair = 2 * focus + side
     later = np.arange(1, len(q))[:, None] < length
-    tally.changes += ((np.diff(pair, axis=0) != 0) & later).sum(axis=0).tolist()
+    row.changes += ((np.diff(pair, axis=0) != 0) & later).sum(axis=0).tolist()
     number = z0[:, 3].astype(int) if z0.shape[1] > 3 else np.zeros(len(z0), dtype=int)
     # A post is passed where the robot came closer than 1 m to its surface.
     last = len(run.path)
@@ -128,7 +149,7 @@ def count_changes(task: Driving, z0: np.ndarray, run, tally: Tally) -> None:
     room = np.linalg.norm(centres - places[:, :, None], axis=3) - task.layouts.radii[number]
     during = np.arange(last)[:, None, None] <= length[:, None]
     near = np.where(during, room, np.inf).min(axis=0) < 1.0
-    tally.passed += near.sum(axis=1).tolist()
+    row.passed += near.sum(axis=1).tolist()
 
 
 # ---- fields and starts
@@ -292,34 +313,6 @@ def rows_of(run: hyrl_mj.Run, task: Driving, seed: int) -> dict[str, Controller]
     }
 
 
-@dataclass
-class Row:
-    """What became of the runs of one controller: as given, without noise, under attack, and by its guard."""
-
-    noisy: Tally = field(default_factory=Tally)
-    quiet: Tally = field(default_factory=Tally)
-    lost: list[bool] = field(default_factory=list)
-    guard: Counter[str] = field(default_factory=Counter)
-
-    def cells(self) -> list[str]:
-        arrived = np.array(self.noisy.outcomes) == "reached"
-        times, ways, quiet = map(np.array, (self.noisy.times, self.noisy.ways, self.quiet.times))
-        spread = [
-            np.percentile(x[arrived], (50, 99)) if arrived.any() else (np.nan, np.nan)
-            for x in (times, ways)
-        ]
-        changes = np.array(self.noisy.changes)
-        beyond = changes - np.array(self.noisy.passed) - 1
-        return [
-            *self.noisy.cells("reached", "crashed"), f"{(arrived & (times > LATE * quiet)).sum()}",
-            *("{:.1f}, {:.1f}".format(*pair) for pair in spread),
-            f"{self.guard['changed'] / self.guard['seen']:.0%}" if self.guard else "",
-            f"{np.median(changes):.0f}, {np.percentile(changes, 99):.0f}" if len(changes) else "",
-            f"{np.median(beyond):.0f}, {(beyond > 0).mean():.0%}" if len(changes) else "",
-            f"{sum(self.lost):,} of {len(self.lost):,}" if self.lost else "",
-        ]  # fmt: skip
-
-
 # ---- the commands
 
 
@@ -328,51 +321,24 @@ def loops_of(run: hyrl_mj.Run, task: Driving) -> dict[str, Controller]:
 
 
 def try_published(run: hyrl_mj.Run, given: argparse.Namespace) -> Table:
-    table = Table("field", "noise", *COUNTS)
-    pairs = json.loads(given.file.read_text())["noise"]
+    table = Table("field", "noise", "controller", *HEADINGS)
     for name, layouts, z0 in published(given.file):
-        for pair in [*pairs, None] if given.rounds else pairs:
-            about = 0.2 if pair is None else 0.1 + pair[0]
-            task = Driving(run.task, layouts, Bounds(), about, TIME, z0)
+        for pair in json.loads(given.file.read_text())["noise"]:
+            task = Driving(run.task, layouts, Bounds(), 0.1 + pair[0], TIME, z0)
+            noise = published_noise(task, len(z0), *pair)
             for who, loop in loops_of(run, task).items():
-                tally = Tally()
+                row = Row()
                 for begun in (loop, *(loop.on_side(q) for q in (0, 1) if who != "policy")):
-                    if pair is None:
-                        drive_attacked(task, who, begun, z0, given.rounds, tally)
-                    else:
-                        drive(task, begun, z0, published_noise(task, len(z0), *pair), tally)
-                noise = "attack 0.1, 0.05" if pair is None else "{:g}, {:g}".format(*pair)
-                table.add_row(name, noise, who, *tally.row())
+                    drive(task, begun, z0, noise, row)
+                    if given.rounds:
+                        wide = Driving(run.task, layouts, Bounds(), 0.2, TIME, z0)
+                        drive_attacked(wide, {who: begun}, z0, given, {who: row})
+                table.add_row(name, "{:g}, {:g}".format(*pair), who, *row.cells())
     return table
 
 
 def try_random(run: hyrl_mj.Run, given: argparse.Namespace) -> Table:
-    tallies: dict[tuple[str, str, str], Tally] = {}
-    bounds, points = Bounds(speeds=0.5 * given.moving), run.critical_set.points
-    for posts in range(3, 13):
-        rng = np.random.default_rng([given.seed, posts])
-        layouts = drawn(rng, posts, max(given.fields // 10, 2), given.moving)
-        task = Driving(run.task, layouts, bounds, 0.2, LONG)
-        from_where = {
-            "M*": starts(layouts, given.starts, rng, points),
-            "anywhere": starts(layouts, given.starts, rng),
-        }
-        for who, loop in loops_of(run, task).items():
-            for where, z0 in from_where.items():
-                for kind in ("none", "alternating", "uniform"):
-                    tally = tallies.setdefault((where, kind, who), Tally())
-                    drive(task, loop, z0, Noise(kind, 0.1), tally)
-                if given.rounds:
-                    tally = tallies.setdefault((where, "attack", who), Tally())
-                    drive_attacked(task, who, loop, z0[:: given.starts], given.rounds, tally)
-    table = Table("field", "noise", *COUNTS)
-    for key in sorted(tallies):
-        table.add_row(*key, *tallies[key].row())
-    return table
-
-
-def try_rows(run: hyrl_mj.Run, given: argparse.Namespace) -> Table:
-    rows: dict[str, Row] = {}
+    rows: dict[str, Row] = defaultdict(Row)
     bounds = Bounds(speeds=0.5 * given.moving)
     for posts in given.posts:
         rng = np.random.default_rng([given.seed, posts])
@@ -384,24 +350,11 @@ def try_rows(run: hyrl_mj.Run, given: argparse.Namespace) -> Table:
             z0 = np.vstack([starts(layouts, near, rng, run.critical_set.points), z0])
         loops = rows_of(run, task, given.seed)
         for name, loop in loops.items():
-            row = rows.setdefault(name, Row())
-            drive(task, loop, z0, None, row.quiet, given.seed)
-            if isinstance(loop, Parts):
-                loop.guard.count.clear()
-            drive(task, loop, z0, Noise(given.noise, 0.1), row.noisy, given.seed)
-            if isinstance(loop, Parts):
-                row.guard += loop.guard.count
+            drive(task, loop, z0, Noise(given.noise, 0.1), rows[name], given.seed)
         if given.rounds:
             tried = {name: loop for name, loop in loops.items() if not name.startswith("random")}
-            budget = Budget(rounds=given.rounds)
-            found = attack(task, tried, z0[:: given.starts], 0.1, budget, seed=given.seed)
-            for name, result in found.items():
-                rows[name].lost += (result.ends.lost & ~result.quiet.lost).tolist()
-    table = Table(
-        "controller", "runs", "arrives", "crashes", "late", "time, s: median, 99%", "way, m: median, 99%",
-        "changed by the guard", "changes: median, 99%", "beyond posts passed + 1: median, share",
-        "attack: lost",
-    )  # fmt: skip
+            drive_attacked(task, tried, z0[:: given.starts], given, rows)
+    table = Table("controller", *HEADINGS)
     for name, row in rows.items():
         table.add_row(name, *row.cells())
     return table
@@ -418,8 +371,7 @@ def try_many(run: hyrl_mj.Run, given: argparse.Namespace) -> str:
     return f"1,000 fields of 12 posts: {time.monotonic() - began:.1f} s"
 
 
-COUNTS = ("controller", "runs", "crashed", "late", "changes (few)", "twice")
-TRIALS = {"published": try_published, "random": try_random, "rows": try_rows, "many": try_many}
+TRIALS = {"published": try_published, "random": try_random, "many": try_many}
 
 
 def main() -> None:
@@ -434,8 +386,8 @@ def main() -> None:
     about = "rounds of the attack; of a random field one start in STARTS is attacked"
     parser.add_argument("--rounds", type=int, default=0, help=about)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--posts", type=int, nargs="+", default=(4, 8, 12), help="of rows")
-    parser.add_argument("--noise", default="alternating", help="of rows")
+    parser.add_argument("--posts", type=int, nargs="+", default=(4, 8, 12), help="of random fields")
+    parser.add_argument("--noise", default="alternating", help="of random fields")
     given = parser.parse_args()
     Console(width=170).print(TRIALS[given.what](hyrl_mj.load_run(given.run), given))
 

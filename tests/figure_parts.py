@@ -14,7 +14,7 @@ from planted import (
 
 from hyrl_mj import ExtendedSets, Noise, simulate
 from hyrl_mj.runs.arcs import overview_arcs, policy_start_arcs
-from hyrl_mj.viz.figures import ShownRun
+from hyrl_mj.viz.figures import ShownRun, style
 from hyrl_mj.viz.section import Section
 
 EPS = 0.1
@@ -25,6 +25,13 @@ def where(path, colour):
     picture = np.asarray(Image.open(path).convert("RGB"))
     same = (picture == np.round(255 * np.array(to_rgb(colour))).astype(int)).all(axis=-1)
     return np.argwhere(same[::-1])[:, ::-1]
+
+
+def written(figure, path):
+    """Returns a figure, which is written if there is a path."""
+    if path is not None:
+        style.write(figure, path)
+    return figure
 
 
 def size_of(path):

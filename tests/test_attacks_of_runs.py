@@ -19,8 +19,7 @@ from hyrl_mj.tasks import SPARING
 from hyrl_mj.viz.commands import commands
 from hyrl_mj.viz.report import render
 from hyrl_mj.viz.shows import replay_shows
-from hyrl_mj.viz.tables import attack_table, comparison_table, robustness_sentence
-from hyrl_mj.viz.terminal import print_robustness
+from hyrl_mj.viz.tables import attack_table, comparison_table, print_robustness, robustness_sentence
 
 FEW = {"episodes": 20, "noise": ("none", "uniform")}
 
@@ -180,7 +179,7 @@ def test_the_replay_of_a_run_with_a_game_is_as_ever(examined, monkeypatch):
 
 def test_the_page_has_the_numbers_and_the_table(examined):
     page = Page(render(load_run(examined)))
-    rows = page.table("The attack")
+    rows = page.table("attack, a search")
     assert [row["controller"] for row in rows] == ["RL policy", "HyRL"]
     assert rows[0]["lost"] == f"{load_run(examined).robustness.attacks[0].lost}"
     assert any("the attack breaks it" in number for number in page.numbers)

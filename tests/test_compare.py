@@ -12,7 +12,6 @@ import pytest
 import torch
 from command_line import call
 from planted import FEW_CELLS
-from stable_baselines3.common.vec_env import VecFrameStack
 
 import hyrl_mj
 from hyrl_mj import BadInput
@@ -20,7 +19,6 @@ from hyrl_mj.alternatives import Alternative, Candidate, Given, Unfit, base, reg
 from hyrl_mj.alternatives.adversary import LearnedNoise, train_adversary
 from hyrl_mj.alternatives.filters import KalmanFilter, MovingAverage
 from hyrl_mj.alternatives.held import HeldInputs, HeldLevels
-from hyrl_mj.alternatives.memory import Stacked
 from hyrl_mj.alternatives.mixture import COMPONENTS, Mixture, MixtureController, MixturePolicy
 from hyrl_mj.alternatives.smooth import PairedBuffer, SmoothPolicy
 from hyrl_mj.alternatives.timer import TimerSupervisor, returns
@@ -154,25 +152,6 @@ def test_filters_close_loops(vehicle, seeking):
 
 
 # ---- memory
-
-
-def test_a_frame_stack_sees_what_vec_frame_stack_shows(given):
-    seen = []
-
-    class Model:
-        def predict(self, observation, deterministic):
-            seen.append(observation.copy())
-            return np.zeros((len(observation), 1), np.float32), None
-
-    size = len(given.task.observation_low)
-    stacked = Stacked(Model(), 3, size)
-    env = environment(given)
-    frames = VecFrameStack(env, 3)
-    observation, memory = frames.reset(), stacked.start(env.num_envs)
-    for _ in range(4):
-        _, memory = stacked.act(memory, observation[:, -size:])
-        np.testing.assert_array_equal(seen[-1], observation)
-        observation, *_ = frames.step(np.zeros((env.num_envs, 1), np.float32))
 
 
 def test_recurrent_says_what_is_missing(given, monkeypatch):
@@ -384,7 +363,6 @@ def test_a_file_makes_an_alternative_which_may_not_fit(mistake, result, folder, 
     @register
     class Never(Alternative):
         name, title = f"never-{type(mistake).__name__}", "never"
-        sentence = "It fits nothing."
 
         def candidates(self, given):
             yield Candidate("first", given.run.controllers["policy"])
@@ -459,4 +437,4 @@ def test_an_alternative_that_wins_stands_first(three):
 
 def test_without_three_seeds_there_is_no_interval(three):
     few = replace(three, rows=tuple(r for r in three.rows if r.seed < 2))
-    assert few.difference("stack", "worst")[1] is None
+    assert few.difference("stack", "worst").interval is None

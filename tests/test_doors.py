@@ -32,8 +32,7 @@ from hyrl_mj.runs.sweeps import Common, Row, Setting, Sweep
 from hyrl_mj.sets import Chart
 from hyrl_mj.system import limits, streams
 from hyrl_mj.tasks import ENVIRONMENT, get_task
-from hyrl_mj.viz.sweep_tables import markdown
-from hyrl_mj.viz.tables import Table
+from hyrl_mj.viz.tables import Table, markdown
 
 CIRCLE = "hyrl_mj/UnitCircle-v0"
 LONGEST = 500  # of a sentence [characters], without the mark of what is left out

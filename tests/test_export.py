@@ -20,7 +20,7 @@ from scipy import special
 
 import hyrl_mj
 from hyrl_mj import BadInput, HybridController, MlpPolicy, export_numpy, export_onnx
-from hyrl_mj.export import export
+from hyrl_mj.export import FORMS, files_of
 from hyrl_mj.export.graph import write_graph
 from hyrl_mj.export.source import write_function
 from hyrl_mj.policies import ACTIVATIONS
@@ -359,16 +359,16 @@ def test_policies_and_sets_of_other_kinds_are_refused(vehicle, circle, tmp_path)
 def test_bad_forms_and_places(circle, tmp_path):
     controller = planted(circle)
     with pytest.raises(BadInput, match="onnx, numpy"):
-        export(controller, "tflite", tmp_path / "x")
+        files_of("tflite", tmp_path / "x")
     (tmp_path / "file").write_text("mine")
     for form in ("onnx", "numpy"):
         with pytest.raises(BadInput, match="a place that can be written"):
-            export(controller, form, tmp_path / "file" / "x")
+            FORMS[form](controller, tmp_path / "file" / "x")
     with pytest.raises(BadInput, match="a place that can be written"):
-        export(controller, "onnx", tmp_path)
+        FORMS["onnx"](controller, tmp_path)
     (tmp_path / "controller.py").write_text("mine")
     with pytest.raises(BadInput, match="exists and is no exported controller"):
-        export(controller, "numpy", tmp_path)
+        FORMS["numpy"](controller, tmp_path)
     assert (tmp_path / "controller.py").read_text() == "mine"
     assert {p.name for p in tmp_path.iterdir()} == {"file", "controller.py"}
 

@@ -71,10 +71,10 @@ def test_outcomes_are_counted(script):
     layouts = Layouts(np.array([[[[-2.0, 0.0]]]]), np.array([[0.5]]), np.zeros((1, 2)))
     z = np.array([[-4.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [-4.0, 2.0, 0.0]])
     task = Driving(hyrl_mj.get_task("field"), layouts, time=5.0, starts=z)
-    tally = script["Tally"]()
-    script["drive"](task, Ahead(), z, None, tally)
-    assert sorted(tally.outcomes) == ["crashed", "reached", "stalled"]
-    assert tally.row()[:3] == ["3", "1", "1"]
+    row = script["Row"]()
+    script["drive"](task, Ahead(), z, hyrl_mj.Noise("none", 0.0), row)
+    assert sorted(row.outcomes) == ["crashed", "reached", "stalled"]
+    assert row.cells()[:4] == ["3", "1", "1", "0"]
 
 
 def test_the_rows_lack_what_their_names_say(script):

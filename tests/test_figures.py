@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from figure_parts import EPS, arcs_of, sets_of, shown_of, where
+from figure_parts import EPS, arcs_of, sets_of, shown_of, where, written
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Wedge
@@ -22,7 +22,7 @@ from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.partition import Partition
 from hyrl_mj.viz import colours, figures
 from hyrl_mj.viz.figures import charts, runs, style
-from hyrl_mj.viz.report import pictures
+from hyrl_mj.viz.pages import pictures
 from hyrl_mj.viz.section import Section
 
 CIRCLE, VEHICLE = hyrl_mj.get_task("unit_circle"), hyrl_mj.get_task("vehicle")
@@ -39,7 +39,7 @@ EVERY_FIGURE = pytest.mark.parametrize("name", NAMES)
 
 def draw(name, task, path=None, /, **changes):
     """Draws a figure of the planted run, with some of what it shows replaced."""
-    return figures.FIGURES[name].draw(replace(SHOWN[task.name], **changes), path)
+    return written(figures.FIGURES[name].draw(replace(SHOWN[task.name], **changes)), path)
 
 
 def lines_of(panel, colour, style="-"):
@@ -148,15 +148,6 @@ def test_a_failed_write_leaves_nothing(tmp_path, monkeypatch, fails):
     assert list(tmp_path.iterdir()) == []
 
 
-@TASKS
-@EVERY_FIGURE
-def test_without_a_path_nothing_is_written(tmp_path, monkeypatch, task, name):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(style.artifacts, "replacing", None)
-    assert isinstance(draw(name, task), Figure)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_every_figure_is_drawn_from_one_kind_of_value_and_has_a_caption():
     kinds = figures.ShownPolicy, figures.ShownRun, figures.ShownGame
     policy, run, game = (figures.names(VEHICLE, kind) for kind in kinds)
@@ -171,8 +162,8 @@ def test_every_figure_is_drawn_from_one_kind_of_value_and_has_a_caption():
 def test_a_new_figure_is_an_entry(tmp_path, monkeypatch):
     without_pictures(monkeypatch)
 
-    def draw_title(shown, path=None):
-        with style.drawing(path, 1.0, shown.task, shown.policy_title) as figure:
+    def draw_title(shown):
+        with style.drawing(1.0, shown.task, shown.policy_title) as figure:
             return figure
 
     monkeypatch.setitem(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import matplotlib
 import numpy as np
 import pytest
-from figure_parts import EPS, size_of, where
+from figure_parts import EPS, size_of, where, written
 from matplotlib.figure import Figure
 from PIL import Image
 from scored import SPACING, score
@@ -90,16 +90,14 @@ def critical_of(*points):
 
 
 def draw_map(task, result, maps, critical, path=None):
-    return figures.draw_robustness_map(
-        figures.ShownGame(Section(task), critical, result, maps), path
-    )
+    shown = figures.ShownGame(Section(task), critical, result, maps)
+    return written(figures.draw_robustness_map(shown), path)
 
 
 def draw_curve(task, result, path=None):
     maps = maps_of(task, [], lambda z: np.zeros(len(z)), cells=8)
-    return figures.draw_robustness_curve(
-        figures.ShownGame(Section(task), critical_of(), result, maps), path
-    )
+    shown = figures.ShownGame(Section(task), critical_of(), result, maps)
+    return written(figures.draw_robustness_curve(shown), path)
 
 
 @pytest.mark.parametrize("task", [CIRCLE, VEHICLE], ids=lambda task: task.name)

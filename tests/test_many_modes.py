@@ -83,7 +83,7 @@ def shown(request):
 
 @pytest.mark.parametrize("name", ["overview", "policy", "extended_sets", "runs"])
 def test_words_do_not_lie_over_each_other(shown, name):
-    figure = figures.FIGURES[name].draw(shown, None)
+    figure = figures.FIGURES[name].draw(shown)
     figure.draw_without_rendering()
     words = [panel.title for panel in figure.axes if panel.axison]
     words += figure.legends[0].get_texts()

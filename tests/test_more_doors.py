@@ -40,7 +40,7 @@ from hyrl_mj.system import limits
 from hyrl_mj.system.streams import _SEQUENCES, Streams
 from hyrl_mj.tasks import described_task, registry
 from hyrl_mj.tasks.scaffold import write_task
-from hyrl_mj.viz import report
+from hyrl_mj.viz import pages
 from hyrl_mj.viz.encoding import video
 from hyrl_mj.viz.figures import style
 
@@ -204,8 +204,9 @@ def test_options_are_shown_without_docstrings():  # as under PYTHONOPTIMIZE=2
 
 
 def test_a_name_is_no_formula(tmp_path, circle):
-    with style.drawing(tmp_path / "a.png", 3.0, circle, "$\\frac{$") as figure:
+    with style.drawing(3.0, circle, "$\\frac{$") as figure:
         figure.subplots().set_xlabel("$$")
+    style.write(figure, tmp_path / "a.png")
     assert (tmp_path / "a.pdf").exists()
 
 
@@ -348,22 +349,21 @@ def test_arguments_that_are_nested_far_are_one_sentence():
 def test_a_video_that_fills_the_memory_is_not_shown(tmp_path):
     Image.new("RGB", (4, 4)).save(tmp_path / "replay.png")
     (tmp_path / "replay.mp4").write_bytes(b"video")
-    assert report.film(tmp_path / "replay.mp4") is not None
+    assert pages.film(tmp_path / "replay.mp4", "", "") is not None
     with (tmp_path / "replay.mp4").open("r+b") as file:
-        file.truncate(report.VIDEO + 1)
-    assert report.film(tmp_path / "replay.mp4") is None
+        file.truncate(pages.VIDEO + 1)
+    assert pages.film(tmp_path / "replay.mp4", "", "") is None
 
 
 def test_a_figure_on_a_full_disk_is_one_sentence(tmp_path, monkeypatch, circle):
     monkeypatch.setattr(style, "DPI", 5)
 
     def work():
-        with style.drawing(Path("a.png"), 3.0, circle, "title"):
-            pass
+        with style.drawing(3.0, circle, "title") as figure:
+            style.write(figure, Path("a.png"))
         room = (Path("a.png").stat().st_size + Path("a.pdf").stat().st_size) // 2
         resource.setrlimit(resource.RLIMIT_FSIZE, (room, room))  # the PNG is the smaller one
-        with style.drawing(Path("b.png"), 3.0, circle, "title"):
-            pass
+        style.write(figure, Path("b.png"))
 
     answer = child(work, tmp_path)
     assert answer.err.splitlines()[-1].startswith(

@@ -10,11 +10,12 @@ from hyrl_mj.viz.tables import (
     arrivals,
     episode_table,
     margin_table,
+    print_robustness,
+    print_summary,
     replay_sentence,
     replay_table,
     score_table,
 )
-from hyrl_mj.viz.terminal import print_robustness, print_summary
 
 pytestmark = pytest.mark.slow  # as in test_pipeline
 

@@ -34,7 +34,7 @@ from hyrl_mj.runs import sweeps
 from hyrl_mj.runs.directory import Run, write_config
 from hyrl_mj.runs.sweeps import Common, Row, Setting, Sweep
 from hyrl_mj.system import cores, progress
-from hyrl_mj.viz import commands, sweep_tables
+from hyrl_mj.viz import commands, sweep_tables, tables
 
 CIRCLE = Setting("unit_circle", "", 0.1)
 SMOKE = {"preset": "smoke", "set": TINY}
@@ -206,7 +206,7 @@ def test_where_nothing_could_be_compared_nothing_is_withstood():
 def test_runs_without_a_figure_are_counted():
     rows = [row(0, hyrl_margin=0.1), row(1, hyrl_margin=None), row(2, hyrl_margin=None)]
     (*_, cells) = sweep_tables.summary_table(Sweep(Common("fast", None, {}), tuple(rows))).rows
-    assert cells == ["HyRL, margin", "0.1, none in 2 of 3 runs"]
+    assert cells == ["HyRL margin", "0.1, none in 2 of 3 runs"]
 
 
 def test_without_ray_one_sentence_says_how_to_install_it(tmp_path):
@@ -240,7 +240,7 @@ def test_tables_show_median_least_and_greatest():
         ["runs", "3 of 4"], ["verdicts", "3 WON"], ["HyRL proved, own q0", "75.00% (50.00% to 100%)"],
     ]  # fmt: skip
     assert sweep_tables.worst(rows).seed == 1
-    assert sweep_tables.markdown(table).splitlines()[1] == "| --- | --- |"
+    assert tables.markdown(table).splitlines()[1] == "| --- | --- |"
 
 
 def test_what_runs_say_reads_well_in_a_log():

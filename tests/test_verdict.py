@@ -27,8 +27,7 @@ from hyrl_mj.judging.sentences import comparison_sentence
 from hyrl_mj.judging.verdict import Verdict, Word
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.simulation import simulate
-from hyrl_mj.viz.tables import comparison_table
-from hyrl_mj.viz.terminal import print_verdict
+from hyrl_mj.viz.tables import comparison_table, print_verdict
 
 PROVED, WON, HELD, UNDECIDED, WEAK, FAILED = Word
 

@@ -7,18 +7,17 @@ from collections.abc import Iterator
 import numpy as np
 
 from hyrl_mj.alternatives.base import Alternative, Candidate, Given, Unfit, register
-from hyrl_mj.policies import HybridController, PolicyController
+from hyrl_mj.policies import HybridController
 from hyrl_mj.sets import GridSet
 from hyrl_mj.stages import ExtendedSets, HeldInputs, Partition, part_policies, table_for
 
 
 @register
 class HysteresisAlone(Alternative):
-    """HyRL without stage 6."""
+    """HyRL's sets; each mode continues what the policy of stage 1 decides on its part."""
 
     name = "hysteresis"
     title = "hysteresis alone"
-    sentence = "HyRL's sets; each mode continues what the policy of stage 1 decides on its part."
 
     def candidates(self, given: Given) -> Iterator[Candidate]:
         run, task = given.run, given.task
@@ -45,11 +44,10 @@ def one_mode(given: Given) -> tuple[ExtendedSets, Partition]:
 
 @register
 class RetrainingAlone(Alternative):
-    """HyRL without modes."""
+    """One policy for all of the chart, trained as stage 6 trains those of modes, without a switch."""
 
     name = "retraining"
     title = "stage 6 alone"
-    sentence = "One policy for all of the chart, trained as stage 6 trains those of modes, without a switch."
 
     def candidates(self, given: Given) -> Iterator[Candidate]:
         from hyrl_mj.stages.grounds import mode_ground
@@ -62,18 +60,15 @@ class RetrainingAlone(Alternative):
         ground = mode_ground(task, sets, 0, parts, given.run.steady, False, s.modes, s.attack)
         policy, result = retrain(ground, s.stage6, given.seed)
         samples = result.attempts * s.stage6.samples
-        yield Candidate("all of the chart", PolicyController(policy), samples)
+        yield Candidate("all of the chart", policy, samples)
 
 
 @register
 class TableAlone(Alternative):
-    """A table without modes."""
+    """One table of inputs for all of the chart, made as those of modes that stage 6 may make."""
 
     name = "table"
     title = "table without modes"
-    sentence = (
-        "One table of inputs for all of the chart, made as those of modes that stage 6 may make."
-    )
 
     def candidates(self, given: Given) -> Iterator[Candidate]:
         sets, _ = one_mode(given)
@@ -83,4 +78,4 @@ class TableAlone(Alternative):
                 "a table takes a chart of at most two dimensions, few inputs, and an arrival that ends the "
                 "episode"
             )
-        yield Candidate("all of the chart", PolicyController(table_for(held, 0)))
+        yield Candidate("all of the chart", table_for(held, 0))

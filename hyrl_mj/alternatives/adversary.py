@@ -15,26 +15,22 @@ from hyrl_mj.alternatives.training import environment, learned
 from hyrl_mj.gym_export import BatchedEnv
 from hyrl_mj.gym_export.sb3_env import TaskVecEnv
 from hyrl_mj.learning.training import export, threads
-from hyrl_mj.policies import MlpPolicy, PolicyController
+from hyrl_mj.policies import MlpPolicy
 from hyrl_mj.simulation import Sample, Signal
 from hyrl_mj.tasks import Task
 
 
 @register
 class TrainedAgainstAdversary(Alternative):
-    """Training by turns with an adversary."""
+    """Policy and an adversary who adds the noise learn by turns (ATLA, Zhang et al. 2021,
+    arXiv:2101.08452)."""
 
     name = "adversary"
     title = "trained against an adversary"
-    sentence = (
-        "Policy and an adversary who adds the noise learn by turns (ATLA, Zhang et al. 2021, "
-        "arXiv:2101.08452)."
-    )
 
     def candidates(self, given: Given) -> Iterator[Candidate]:
         for turns in (2, 4):
-            policy = _by_turns(given, turns)
-            yield Candidate(f"{turns} turns", PolicyController(policy), given.samples)
+            yield Candidate(f"{turns} turns", _by_turns(given, turns), given.samples)
 
 
 def _by_turns(given: Given, turns: int) -> MlpPolicy:
@@ -44,15 +40,15 @@ def _by_turns(given: Given, turns: int) -> MlpPolicy:
     """
     share = given.samples // (2 * turns + 1)
 
-    def controller(model: Any) -> PolicyController:
-        return PolicyController(export(model, given.task))
+    def policy(model: Any) -> MlpPolicy:
+        return export(model, given.task)
 
-    model = learned(given, environment(given), controller, samples=share)
+    model = learned(given, environment(given), policy, samples=share)
     for turn in range(turns):
-        adversary = train_adversary(given, export(model, given.task), share, turn)
+        adversary = train_adversary(given, policy(model), share, turn)
         env, start = environment(given, adversary), model.policy.state_dict()
-        model = learned(given, env, controller, samples=share, start=start)
-    return export(model, given.task)
+        model = learned(given, env, policy, samples=share, start=start)
+    return policy(model)
 
 
 class LearnedNoise(Signal):

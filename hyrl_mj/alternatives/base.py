@@ -21,19 +21,29 @@ class Unfit(BadInput):
     """An alternative does not fit the task, or lacks a package: its row says so, and the others go on."""
 
 
+def as_controller(acts: Controller | Policy) -> Controller:
+    """Returns a controller; a policy alone as one."""
+    return PolicyController(acts) if isinstance(acts, Policy) else acts
+
+
 @dataclass(frozen=True)
 class Candidate:
     """One setting of an alternative.
 
     Attributes:
         label: what differs from the others of the same alternative, as "3 samples".
-        controller: what closes the loop.
+        acts: what closes the loop: a controller, or a policy alone.
         samples: of the environment, that its trainings took; 0 if it goes by the policies of the run.
     """
 
     label: str
-    controller: Controller
+    acts: Controller | Policy
     samples: int = 0
+
+    @property
+    def controller(self) -> Controller:
+        """What closes the loop, as a controller."""
+        return as_controller(self.acts)
 
 
 @dataclass(frozen=True)
@@ -86,12 +96,12 @@ class Given:
         """Returns noise of a kind with the bound of the run."""
         return Noise(kind, self.eps, self.run.settings.everywhere)
 
-    def won(self, controller: Controller | Policy, kinds: tuple[str, ...]) -> float:
+    def won(self, acts: Controller | Policy, kinds: tuple[str, ...]) -> float:
         """Returns the least share of starts that are won under some kinds of noise.
 
         The starts and the noise are others than those of the examination, by which nothing is chosen.
         """
-        loop = PolicyController(controller) if isinstance(controller, Policy) else controller
+        loop = as_controller(acts)
         z0 = self.task.starts(TRIED, np.random.default_rng([self.seed, 1]))
         settings = LoopSettings(vary=True, quiet=True)
         runs = (
@@ -111,12 +121,10 @@ class Alternative(ABC):
     Attributes:
         name: as in `hyrl-mj compare --only NAME`.
         title: as in tables.
-        sentence: how it works, in a sentence.
     """
 
     name: str
     title: str
-    sentence: str
 
     @abstractmethod
     def candidates(self, given: Given) -> Iterator[Candidate]:

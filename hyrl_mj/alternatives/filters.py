@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from hyrl_mj.alternatives.base import Alternative, Candidate, Given, register
-from hyrl_mj.policies import Policy, PolicyController
+from hyrl_mj.policies import Policy
 from hyrl_mj.tasks import Task
 
 
@@ -93,19 +93,16 @@ class KalmanFilter:
 
 @register
 class Filtered(Alternative):
-    """Filtered measurements."""
+    """A moving average, or a Kalman filter on the task's own plant, before the policy of stage 1."""
 
     name = "filtered"
     title = "filtered"
-    sentence = "A moving average, or a Kalman filter on the task's own plant, before the policy of stage 1."
 
     def candidates(self, given: Given) -> Iterator[Candidate]:
         task, policy = given.task, given.run.steady
         for length in (2, 4, 8):
-            controller = PolicyController(MovingAverage(task, policy, length))
-            yield Candidate(f"mean of {length}", controller)
+            yield Candidate(f"mean of {length}", MovingAverage(task, policy, length))
         if given.run.why_no_game is not None:  # the chart is not all that the plant remembers
             return
         for drift in (0.0, 0.02, 0.2):
-            controller = PolicyController(KalmanFilter(task, policy, drift))
-            yield Candidate(f"Kalman filter, drift {drift:g}", controller)
+            yield Candidate(f"Kalman filter, drift {drift:g}", KalmanFilter(task, policy, drift))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hyrl_mj.alternatives.base import Alternative, Candidate, Given, register
-from hyrl_mj.policies import Controller, Policy, PolicyController
+from hyrl_mj.policies import Policy
 from hyrl_mj.tasks import Task
 
 
@@ -78,18 +78,13 @@ class HeldInputs:
 
 @register
 class Held(Alternative):
-    """Decisions that are held."""
+    """Each input of the policy of stage 1 is applied for several samples."""
 
     name = "held"
     title = "inputs held"
-    sentence = "Each input of the policy of stage 1 is applied for several samples."
 
     def candidates(self, given: Given) -> Iterator[Candidate]:
         task, policy = given.task, given.run.steady
+        held = HeldInputs if task.input_levels is None else HeldLevels
         for samples in (2, 3, 5, 8):
-            held: Controller
-            if task.input_levels is None:
-                held = PolicyController(HeldInputs(task, policy, samples))
-            else:
-                held = HeldLevels(task, policy, samples)
-            yield Candidate(f"{samples} samples", held)
+            yield Candidate(f"{samples} samples", held(task, policy, samples))

@@ -3,66 +3,42 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
-import numpy as np
 from stable_baselines3.common.vec_env import VecFrameStack
 
 from hyrl_mj.alternatives.base import Alternative, Candidate, Given, Unfit, register
 from hyrl_mj.alternatives.training import environment, learned
-from hyrl_mj.policies import PolicyController, from_callable
-
-
-@dataclass(frozen=True)
-class Stacked:
-    """A model on the last observations, zeros before the first, as SB3's `VecFrameStack` gives them.
-
-    Attributes:
-        model: SB3's model.
-        length: the number of observations.
-        size: the length of one.
-    """
-
-    model: Any
-    length: int
-    size: int
-
-    def start(self, n: int) -> np.ndarray:
-        return np.zeros((n, (self.length - 1) * self.size))
-
-    def act(self, memory: np.ndarray, observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        frames = np.hstack([memory, observation])
-        actions, _ = self.model.predict(frames.astype(np.float32), deterministic=True)
-        return actions, frames[:, self.size :]
+from hyrl_mj.learning.training import export
+from hyrl_mj.policies import PreprocessedPolicy, Preprocessing, from_callable
 
 
 @register
 class FrameStack(Alternative):
-    """The last observations."""
+    """PPO on the last 4 observations, trained under uniform noise."""
 
     name = "stack"
     title = "frame stack"
-    sentence = "PPO on the last 4 observations, trained under uniform noise."
 
     def candidates(self, given: Given) -> Iterator[Candidate]:
-        length, size = 4, len(given.task.observation_low)
+        length = 4
 
-        def controller(model: Any) -> PolicyController:
-            return PolicyController(from_callable(Stacked(model, length, size), given.task))
+        def policy(model: Any) -> PreprocessedPolicy:
+            network = export(model, given.task, length)
+            return PreprocessedPolicy(network, Preprocessing(n_stack=length))
 
         env = VecFrameStack(environment(given, "uniform"), length)
-        model = learned(given, env, controller)
-        yield Candidate(f"{length} observations", controller(model), given.samples)
+        model = learned(given, env, policy)
+        yield Candidate(f"{length} observations", policy(model), given.samples)
 
 
 @register
 class Recurrent(Alternative):
-    """A recurrent network."""
+    """RecurrentPPO (an LSTM of 64 cells), trained under uniform noise."""
 
     name = "recurrent"
     title = "recurrent"
-    sentence = "RecurrentPPO (an LSTM of 64 cells), trained under uniform noise."
 
     def candidates(self, given: Given) -> Iterator[Candidate]:
         try:
@@ -70,17 +46,14 @@ class Recurrent(Alternative):
         except ImportError:
             raise Unfit("sb3-contrib is missing: pip install sb3-contrib") from None
 
-        def controller(model: Any) -> PolicyController:
-            return PolicyController(from_callable(model, given.task))
-
         hidden = given.training("ppo").hidden
         model = learned(
             given,
             environment(given, "uniform"),
-            controller,
+            partial(from_callable, task=given.task),
             policy="MlpLstmPolicy",
             algorithm=RecurrentPPO,
             net_arch=list(hidden[:1]),
             lstm_hidden_size=64,
         )
-        yield Candidate("64 cells", controller(model), given.samples)
+        yield Candidate("64 cells", from_callable(model, given.task), given.samples)

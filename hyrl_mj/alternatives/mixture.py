@@ -137,14 +137,11 @@ class MixtureController:
 
 @register
 class MixtureOfPolicies(Alternative):
-    """Several modes in one policy."""
+    """PPO with two components and a gate (after MUPO, Zou et al. 2024, arXiv:2403.12847): the most probable
+    component at each sample, or that of the first measurement for the whole episode."""
 
     name = "mixture"
     title = "mixture of two"
-    sentence = (
-        "PPO with two components and a gate (after MUPO, Zou et al. 2024, arXiv:2403.12847): the most "
-        "probable component at each sample, or that of the first measurement for the whole episode."
-    )
 
     def candidates(self, given: Given) -> Iterator[Candidate]:
         task = given.task

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from hyrl_mj.alternatives.base import Alternative, Candidate, Given, register
 from hyrl_mj.learning import Training
 from hyrl_mj.learning.training import Score, TaskGround, train
-from hyrl_mj.policies import MlpPolicy, PolicyController
+from hyrl_mj.policies import MlpPolicy
 from hyrl_mj.simulation import AnyNoise
 
 
@@ -25,11 +25,10 @@ class NoisyGround(TaskGround):
 
 @register
 class TrainedUnderNoise(Alternative):
-    """Training under noise."""
+    """The policy of stage 1, trained under uniform, alternating or constant noise."""
 
     name = "noise"
     title = "trained under noise"
-    sentence = "The policy of stage 1, trained under uniform, alternating or constant noise."
 
     def candidates(self, given: Given) -> Iterator[Candidate]:
         settings = given.training()
@@ -38,4 +37,4 @@ class TrainedUnderNoise(Alternative):
             policy = train(
                 given.task, settings, given.seed, ground=ground, label=f"under {kind} noise"
             )
-            yield Candidate(f"{kind} noise", PolicyController(policy), settings.samples)
+            yield Candidate(f"{kind} noise", policy, settings.samples)

@@ -8,11 +8,10 @@ from hyrl_mj.learning import Training
 
 @register
 class StageOne(Alternative):
-    """The policy of stage 1."""
+    """The policy of stage 1, trained without noise."""
 
     name = "policy"
     title = "RL policy"
-    sentence = "The policy of stage 1, trained without noise."
 
     def candidates(self, given: Given) -> Iterator[Candidate]:
         settings = given.run.settings.stage1
@@ -22,11 +21,10 @@ class StageOne(Alternative):
 
 @register
 class Hyrl(Alternative):
-    """The hybrid controller."""
+    """The hybrid controller of all stages."""
 
     name = "hyrl"
     title = "HyRL"
-    sentence = "The hybrid controller of all stages."
 
     def candidates(self, given: Given) -> Iterator[Candidate]:
         yield Candidate("as made", given.run.controllers["hyrl"], given.samples)

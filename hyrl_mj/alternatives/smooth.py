@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Generator, Iterator
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -14,7 +15,6 @@ from stable_baselines3.common.type_aliases import RolloutBufferSamples
 from hyrl_mj.alternatives.base import Alternative, Candidate, Given, register
 from hyrl_mj.alternatives.training import environment, learned
 from hyrl_mj.learning.training import export
-from hyrl_mj.policies import PolicyController
 
 # The coefficient of SB3's entropy bonus where a task has none: the penalty is part of that term.
 LEAST_BONUS = 1e-4
@@ -71,18 +71,14 @@ class SmoothPolicy(ActorCriticPolicy):
 
 @register
 class Smooth(Alternative):
-    """Smooth policies."""
+    """PPO with a penalty for changes of the input, by CAPS or of the policy's slope."""
 
     name = "smooth"
     title = "smooth (CAPS, Lipschitz)"
-    sentence = "PPO with a penalty for changes of the input, by CAPS or of the policy's slope."
 
     def candidates(self, given: Given) -> Iterator[Candidate]:
         task = given.task
         bonus = max(given.training("ppo").options.get("ent_coef", 0.0), LEAST_BONUS)
-
-        def controller(model: Any) -> PolicyController:
-            return PolicyController(export(model, task))
 
         kinds: tuple[tuple[Kind, float], ...] = (
             ("CAPS", 0.01), ("CAPS", 0.1), ("Lipschitz", 1e-4), ("Lipschitz", 1e-2),
@@ -91,11 +87,11 @@ class Smooth(Alternative):
             model = learned(
                 given,
                 environment(given),
-                controller,
+                partial(export, task=task),
                 policy=SmoothPolicy,
                 kind=kind,
                 weight=weight / bonus,
                 deviation=given.eps,
                 options={"ent_coef": bonus, "rollout_buffer_class": PairedBuffer},
             )
-            yield Candidate(f"{kind}, weight {weight:g}", controller(model), given.samples)
+            yield Candidate(f"{kind}, weight {weight:g}", export(model, task), given.samples)

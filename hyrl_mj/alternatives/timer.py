@@ -79,14 +79,11 @@ def returns(task: Task, policy: Policy, z: np.ndarray, gamma: float) -> np.ndarr
 
 @register
 class Timer(Alternative):
-    """A supervisor with a timer."""
+    """Of the policies of HyRL's modes that of the greatest value acts, and for a least time (after de
+    Priester et al., RLC 2025), in place of sets with hysteresis."""
 
     name = "timer"
     title = "timer supervisor"
-    sentence = (
-        "Of the policies of HyRL's modes that of the greatest value acts, and for a least time (after "
-        "de Priester et al., RLC 2025), in place of sets with hysteresis."
-    )
 
     def candidates(self, given: Given) -> Iterator[Candidate]:
         run, task = given.run, given.task

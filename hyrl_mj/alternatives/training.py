@@ -15,7 +15,7 @@ from hyrl_mj.alternatives.base import Given
 from hyrl_mj.gym_export import BatchedEnv
 from hyrl_mj.gym_export.sb3_env import TaskVecEnv
 from hyrl_mj.learning.training import spread_kinks, threads, with_settings
-from hyrl_mj.policies import Controller
+from hyrl_mj.policies import Controller, Policy
 from hyrl_mj.simulation import AnyNoise
 
 # The kinds of noise by which checkpoints are judged: the worse of the two counts.
@@ -34,7 +34,7 @@ def environment(given: Given, noise: str | AnyNoise = "none") -> TaskVecEnv:
 def learned(
     given: Given,
     env: VecEnv,
-    controller: Callable[[Any], Controller],
+    acting: Callable[[Any], Controller | Policy],
     *,
     policy: str | type[Any] = "MlpPolicy",
     algorithm: type[BaseAlgorithm] = PPO,
@@ -51,7 +51,7 @@ def learned(
     Args:
         given: what may be used.
         env: the episodes.
-        controller: returns a model as a controller, by which it is judged.
+        acting: returns what a model is judged by: a policy, or a controller.
         policy: SB3's policy.
         algorithm: SB3's algorithm, with the interface of PPO's.
         samples: of the training, by default all.
@@ -59,7 +59,7 @@ def learned(
         options: arguments of the algorithm to change.
         of_policy: arguments of the policy to change.
     """
-    settings, best = given.training("ppo"), _Best(given, controller)
+    settings, best = given.training("ppo"), _Best(given, acting)
     arguments = {**settings.options, **options}
     with threads(1):  # faster for small networks
         model = with_settings(algorithm, policy, env, settings, given.seed, of_policy, arguments)
@@ -75,9 +75,9 @@ def learned(
 class _Best(BaseCallback):
     """Keeps the weights of the best checkpoint."""
 
-    def __init__(self, given: Given, controller: Callable[[Any], Controller]):
+    def __init__(self, given: Given, acting: Callable[[Any], Controller | Policy]):
         super().__init__()
-        self._given, self._controller = given, controller
+        self._given, self._acting = given, acting
         self._won, self.state = -1.0, {}  # type: float, dict[str, Any]
         self._every = max(given.samples // given.task.effort.checkpoints, 1)
         self._next = self._every
@@ -92,7 +92,7 @@ class _Best(BaseCallback):
         self._judge()
 
     def _judge(self) -> None:
-        won = self._given.won(self._controller(self.model), JUDGED)
+        won = self._given.won(self._acting(self.model), JUDGED)
         if won >= self._won:  # of equally good ones the latest
             tensors = self.model.policy.state_dict()
             self._won, self.state = won, {name: value.clone() for name, value in tensors.items()}

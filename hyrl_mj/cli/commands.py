@@ -439,10 +439,10 @@ def export(run: Run, *, to: str, out: Path, field: Path | None = None, force: bo
             default one post.
         force: overwrite a file that hyrl-mj has not written.
     """
-    from hyrl_mj.export import export, files_of
+    from hyrl_mj.export import FORMS, files_of
 
     with trust.output(*files_of(to, out), force=force):
-        export(exported_controller(run.controller, field), to, out)
+        FORMS[to](exported_controller(run.controller, field), out)
     print(f"controller at {out}")
 
 

@@ -29,7 +29,6 @@ DISTRIBUTIONS = (
     "numpy",
     "scipy",
     "safetensors",
-    "mediapy",
     "imageio-ffmpeg",
     "pillow",
     "matplotlib",

@@ -8,6 +8,6 @@ turns Python numbers into float32, and has no NumPy form; and arrays of ndonnx a
 passed to NumPy's functions.
 """
 
-from hyrl_mj.export.forms import export, export_numpy, export_onnx, files_of
+from hyrl_mj.export.forms import FORMS, export_numpy, export_onnx, files_of
 
-__all__ = ["export", "export_numpy", "export_onnx", "files_of"]
+__all__ = ["FORMS", "export_numpy", "export_onnx", "files_of"]

@@ -111,26 +111,14 @@ FORMS: dict[str, Callable[..., Any]] = {"onnx": export_onnx, "numpy": export_num
 
 
 def files_of(form: str, out: Path) -> list[Path]:
-    """Returns the files that `export` writes.
-
-    Raises:
-        BadInput: the form is unknown.
-    """
+    """Returns the files that a form writes; raises `BadInput` if the form is unknown."""
     if form not in FORMS:
         raise unknown("form", form, FORMS)
-    numpy_form = [out / TEMPLATE.name, out / TEMPLATE.with_suffix(".npz").name]
-    return numpy_form if form == "numpy" else [out]
-
-
-def export(controller: Exportable, form: str, out: Path) -> None:
-    """Writes a controller in one of `FORMS`.
-
-    Raises:
-        BadInput: the form is unknown, or the errors of `export_numpy` and `export_onnx`.
-    """
-    if form not in FORMS:
-        raise unknown("form", form, FORMS)
-    FORMS[form](controller, out)
+    return (
+        [out / TEMPLATE.name, (out / TEMPLATE.name).with_suffix(".npz")]
+        if form == "numpy"
+        else [out]
+    )
 
 
 def _write(controller: Exportable, folder: Path) -> tuple[Path, Path]:

@@ -260,13 +260,14 @@ def _described(settings: Training) -> str:
     return ", ".join(f"{name} {value}" for name, value in values.items())
 
 
-def export(model: BaseAlgorithm, task: Task) -> MlpPolicy:
-    """Returns the current policy of an SB3 algorithm as a plain network."""
+def export(model: BaseAlgorithm, task: Task, frames: int = 1) -> MlpPolicy:
+    """Returns the current policy of an SB3 algorithm, which sees so many observations, as a plain network."""
     state = symmetry.plain_state(model.policy, task)
     weights = {name: tensor.detach().cpu().numpy().copy() for name, tensor in state.items()}
     activation = next(n for n, a in ACTIVATIONS.items() if a is model.policy.activation_fn)
     own = (name for name in ALGORITHMS if type(model) is algorithms.sb3_class(name))
-    return MlpPolicy(task, next(own, "") or infer_algorithm(weights, {}), activation, weights)
+    algorithm = next(own, "") or infer_algorithm(weights, {})
+    return MlpPolicy(task, algorithm, activation, weights, frames)
 
 
 @contextmanager

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from functools import partial
 from typing import Any, Self
 
 from hyrl_mj.runs.sweeps import Row
@@ -19,16 +20,19 @@ class Board:
     """
 
     def __init__(self, say: Say | None, count: int):
-        self._say, self._count, self._ended = say, count, 0
+        self._count, self._ended = count, 0
         self._began: dict[str, float] = {}
         self._latest: dict[str, str] = {}
         self._live: Any = None
-
-    def __enter__(self) -> Self:
-        if self._say is None and sys.stdout is not None and sys.stdout.isatty():
+        self._say: Say = say or partial(print, flush=True)
+        if say is None and sys.stdout is not None and sys.stdout.isatty():
             from rich.live import Live
 
             self._live = Live(get_renderable=self._picture, transient=True, refresh_per_second=2)
+            self._say = partial(self._live.console.print, markup=False, highlight=False)
+
+    def __enter__(self) -> Self:
+        if self._live is not None:
             self._live.start()
         return self
 
@@ -41,7 +45,7 @@ class Board:
         began = self._began.setdefault(row.name, time.monotonic())
         self._latest[row.name] = text
         if self._live is None:
-            self._print(f"{row.name}: {time.monotonic() - began:.0f} s: {text}")
+            self._say(f"{row.name}: {time.monotonic() - began:.0f} s: {text}")
 
     def end(self, row: Row, how: str = "") -> None:
         """Shows how a run ended."""
@@ -49,15 +53,7 @@ class Board:
         self._latest.pop(row.name, None)
         end = row.sentence if row.verdict == "" else f"{row.verdict}: {row.sentence}"
         end = end if row.done else f"stopped: {end}"
-        self._print(f"{row.name}: {row.seconds:.0f} s: {how}{end} ({self._ended} of {self._count})")
-
-    def _print(self, text: str) -> None:
-        if self._say is not None:
-            self._say(text)
-        elif self._live is not None:
-            self._live.console.print(text, markup=False, highlight=False)
-        else:
-            print(text, flush=True)
+        self._say(f"{row.name}: {row.seconds:.0f} s: {how}{end} ({self._ended} of {self._count})")
 
     def _picture(self) -> Any:
         from rich.text import Text

@@ -136,38 +136,21 @@ def _told(row: Row) -> str:
 
 def judged(made: Run, name: str, *, seed: int) -> Row:
     """Returns the row of an alternative: the best of its settings, judged as HyRL is."""
-    from hyrl_mj.alternatives import registered
-
-    row = Row(name, registered()[name].title, seed)
-    try:
-        return _made(made, row)
-    except BadInput as error:  # the others go on
-        return replace(row, state="unfit", sentence=str(error))
-
-
-def _made(made: Run, row: Row) -> Row:
-    """Returns the row of an alternative with its results.
-
-    Raises:
-        BadInput: it does not fit the task.
-    """
     from hyrl_mj.alternatives import Given, registered
 
-    began, seed = time.monotonic(), row.seed
-    candidates = [*registered()[row.name].candidates(Given(made, seed))]
-    one = len(candidates) == 1
-    scores = [0.0 if one else _worst(made, each.controller, seed) for each in candidates]
-    best = candidates[int(np.argmax(scores))]
-    seconds = time.monotonic() - began
-    return replace(
-        row,
-        state="done",
-        sentence=best.label,
-        tried={} if one else dict(zip([c.label for c in candidates], scores, strict=True)),
-        samples=best.samples,
-        seconds=seconds,
-        figures=figures_of(made, best.controller, seed),
-    )
+    began, kind = time.monotonic(), registered()[name]
+    row = Row(name, kind.title, seed)
+    try:
+        candidates = [*kind.candidates(Given(made, seed))]
+        tried: dict[str, float] = {}
+        if len(candidates) > 1:
+            tried = {c.label: _worst(made, c.controller, seed) for c in candidates}
+        best = max(candidates, key=lambda one: tried.get(one.label, 0.0))  # the first of the best
+        seconds = time.monotonic() - began
+        figures = figures_of(made, best.controller, seed)
+    except BadInput as error:  # the others go on
+        return replace(row, state="unfit", sentence=str(error))
+    return Row(name, kind.title, seed, "done", best.label, tried, best.samples, seconds, figures)
 
 
 def _playable(made: Run, controller: Controller) -> bool:

@@ -109,12 +109,11 @@ def extended_sets_stage(run: Run, say: Say) -> None:
 
 def retrain_stage(run: Run, say: Say) -> None:
     """Stage 6: trains the policy of each mode."""
-    s, sets, task = run.settings, run.extended_sets, run.task
-    algorithms.check_named(s.stage6.algorithm)
-    held = HeldInputs.from_sets(task, sets, s.table) if task.effort.attacked else None
-    work = partial(
-        _retrained, task, s, sets, run.steady, run.partition, run.split, held, run.path / "logs"
-    )
+    sets, task = run.extended_sets, run.task
+    algorithms.check_named(run.settings.stage6.algorithm)
+    held = HeldInputs.from_sets(task, sets, run.settings.table) if task.effort.attacked else None
+    results = run.settings, run.steady, run.partition, run.split, run.path / "logs"
+    work = partial(_retrained, task, sets, held, *results)
     done: list[tuple[ModePolicy, ModeResult]] = []
     if task.mirror is None:
         done += cores.in_processes(work, sets.modes)
@@ -130,12 +129,12 @@ def retrain_stage(run: Run, say: Say) -> None:
 
 def _retrained(
     task: Task,
-    settings: Settings,
     sets: ExtendedSets,
+    held: HeldInputs | None,
+    s: Settings,
     policy: Policy,
     partition: Partition,
     split: Partition,
-    held: HeldInputs | None,
     logs: Path,
     mode: int,
     others: Iterable[tuple[ModePolicy, ModeResult]] = (),
@@ -147,9 +146,8 @@ def _retrained(
     part = None
     if task.effort.attacked:
         part = part_policies(task, policy, partition, sets.eps)[mode]
-    table, s = held is not None, settings
     return retrain(
-        mode_ground(task, sets, mode, split, policy, table, s.modes, s.attack),
+        mode_ground(task, sets, mode, split, policy, held is not None, s.modes, s.attack),
         s.stage6,
         s.seed,
         warm_start=partial(start_policy, policy, partition),

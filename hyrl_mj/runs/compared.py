@@ -11,7 +11,7 @@ import numpy as np
 from hyrl_mj.errors import BadInput
 from hyrl_mj.files import artifacts
 from hyrl_mj.files.manifest import may_hold
-from hyrl_mj.runs.improvement import LEAST_SEEDS
+from hyrl_mj.runs.improvement import Mean, mean
 
 NAME = "compare.json"
 
@@ -83,23 +83,11 @@ class Compared:
         """Returns a figure of an alternative by seed, without the seeds that lack it."""
         return [row.figures[figure] for row in self.of(name) if figure in row.figures]
 
-    def difference(self, name: str, figure: str) -> tuple[float, tuple[float, float] | None]:
-        """Returns by how much more of a figure HyRL has than an alternative, and its 95% interval.
-
-        It is the mean over the seeds that both have, and a bootstrap over them; no interval with fewer than
-        three.
-        """
-        from scipy.stats import bootstrap  # slow to import, and seldom needed
-
-        hyrl, other = ({r.seed: r.figures.get(figure) for r in self.of(n)} for n in ("hyrl", name))
-        pairs = ((hyrl[seed], other[seed]) for seed in hyrl.keys() & other.keys())
-        apart = np.array([a - b for a, b in pairs if a is not None and b is not None])
-        if len(apart) < LEAST_SEEDS or not np.ptp(apart):
-            return float(apart.mean()), None
-        found = bootstrap(
-            [apart], np.mean, method="percentile", random_state=np.random.default_rng(0)
-        ).confidence_interval
-        return float(apart.mean()), (float(found.low), float(found.high))
+    def difference(self, name: str, figure: str) -> Mean:
+        """Returns by how much more of a figure HyRL has than an alternative, in the seeds that both have."""
+        other, hyrl = ({r.seed: r.figures.get(figure) for r in self.of(n)} for n in (name, "hyrl"))
+        pairs = [(other[seed], hyrl[seed], 0.0) for seed in other.keys() & hyrl.keys()]
+        return mean([np.array([pair for pair in pairs if None not in pair])], np.array((-1, 1)))
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -70,43 +70,38 @@ def improvements(rows: Iterable[Row]) -> list[Improvement]:
     done = [row for row in rows if row.done]
     found = []
     for figure, more in COMPARED.items():
-        groups: dict[Setting, list[tuple[float, float, float]]] = {}
+        # Of policy and HyRL, and the number of starts that were tried, 0 where the figure is no share.
+        by_setting: dict[Setting, list[tuple[float, float, float]]] = {}
         for row in done:
             policy, hyrl = (row.figures.get(f"{who}_{figure}") for who in ("policy", "hyrl"))
             if policy is not None and hyrl is not None:
                 starts = row.figures.get(SAMPLED.get(figure, "")) or 0.0
-                groups.setdefault(row.setting, []).append((policy, hyrl, starts))
-        if groups:
-            found.append(_improvement(figure, more, [np.array(g) for g in groups.values()]))
+                by_setting.setdefault(row.setting, []).append((policy, hyrl, starts))
+        if not by_setting:
+            continue
+        groups, better = [np.array(group) for group in by_setting.values()], []
+        for runs in groups:
+            apart = (runs[None, :, 1] - runs[:, None, 0]) * (1 if more else -1)
+            better.append(float(np.mean((apart > 0) + (apart == 0) / 2)))
+        policies, hyrls, apart = (mean(groups, np.array(by)) for by in ((1, 0), (0, 1), (-1, 1)))
+        count, probability = sum(map(len, groups)), float(np.mean(better))
+        found.append(Improvement(figure, count, policies, hyrls, apart, probability))
     return found
 
 
-def _improvement(figure: str, more: bool, groups: Sequence[np.ndarray]) -> Improvement:
-    """Returns the improvement of a figure.
+def mean(groups: Sequence[np.ndarray], by: np.ndarray) -> Mean:
+    """Returns the mean of policy and HyRL, times `by` (2,), over the seeds and then over the settings.
 
     Args:
-        figure: its name.
-        more: whether more of it is better.
         groups: for each setting the values (seeds, 3) of policy and HyRL, and the number of starts that were
-            tried, 0 for a figure that is not a share of them.
+            tried.
+        by: factors of the values.
     """
-    better = []
-    for runs in groups:
-        apart = (runs[None, :, 1] - runs[:, None, 0]) * (1 if more else -1)
-        better.append(float(np.mean((apart > 0) + (apart == 0) / 2)))
-    policy, hyrl, difference = (_mean(groups, np.array(by)) for by in ((1, 0), (0, 1), (-1, 1)))
-    return Improvement(
-        figure, sum(map(len, groups)), policy, hyrl, difference, float(np.mean(better))
-    )
-
-
-def _mean(groups: Sequence[np.ndarray], by: np.ndarray) -> Mean:
-    """Returns the mean of both values of each run (seeds, 3), times `by` (2,), with its interval."""
     from scipy.stats import bootstrap  # slow to import, and seldom needed
 
     rng = np.random.default_rng(0)
 
-    def mean(*chosen: np.ndarray, axis: int = -1) -> np.ndarray:
+    def of_drawn(*chosen: np.ndarray, axis: int = -1) -> np.ndarray:
         means = []
         for runs, numbers in zip(groups, chosen, strict=True):
             drawn = runs[numbers.astype(int)]
@@ -122,7 +117,7 @@ def _mean(groups: Sequence[np.ndarray], by: np.ndarray) -> Mean:
         return Mean(whole, None)
     found = bootstrap(
         [np.arange(len(runs)) for runs in groups],
-        mean,
+        of_drawn,
         n_resamples=9_999,
         method="percentile",
         vectorized=True,

@@ -11,8 +11,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-
 from hyrl_mj.errors import BadArtifact, BadInput
 from hyrl_mj.files import artifacts
 from hyrl_mj.files.manifest import check_contents, may_hold
@@ -322,9 +320,3 @@ def _compared(robustness: Robustness, timed: bool = True) -> dict[str, float]:
             ):
                 figures[f"{who}_{name}"] = max(value, figures.get(f"{who}_{name}", 0.0))
     return figures
-
-
-def summary(figures: Iterable[float | None]) -> tuple[float, float, float] | None:
-    """Returns median, least and greatest of some figures; None if there are none."""
-    values = [value for value in figures if value is not None]
-    return (float(np.median(values)), min(values), max(values)) if values else None

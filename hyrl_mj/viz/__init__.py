@@ -8,8 +8,13 @@ from hyrl_mj.viz.commands import beginning
 from hyrl_mj.viz.compared_tables import print_compared
 from hyrl_mj.viz.options import ReplayOptions
 from hyrl_mj.viz.sweep_tables import print_sweep
-from hyrl_mj.viz.tables import replay_sentence, robustness_sentence
-from hyrl_mj.viz.terminal import print_noise, print_robustness, print_summary
+from hyrl_mj.viz.tables import (
+    print_noise,
+    print_robustness,
+    print_summary,
+    replay_sentence,
+    robustness_sentence,
+)
 
 __all__ = [
     "ReplayOptions",
@@ -19,6 +24,7 @@ __all__ = [
     "drives",
     "encoding",
     "figures",
+    "pages",
     "print_compared",
     "print_noise",
     "print_robustness",

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
 from hyrl_mj.judging.game import percent
 from hyrl_mj.runs.compared import Compared, Row
-from hyrl_mj.viz.tables import Table
-from hyrl_mj.viz.terminal import print_table
+from hyrl_mj.viz.tables import Table, print_table, spread
 
 # The figures in the table, with the headings of their columns and whether they are shares.
 COLUMNS = {
@@ -54,7 +54,8 @@ def result_table(compared: Compared, brief: bool = False) -> Table:
             row["samples trained"] = f"{np.mean([r.samples for r in of]):,.0f}"
             row["seconds"] = f"{np.mean([r.seconds for r in of]):.0f}"
         rows.append(row)
-    return Table.of(f"{compared.task}: what would do instead, noise {compared.eps:g}", rows)
+    title = f"{compared.task}: what would do instead, noise {compared.eps:g}"
+    return Table.of(title, rows, "Means over the seeds (least to greatest where they differ).")
 
 
 def _settings(rows: list[Row]) -> str:
@@ -67,9 +68,8 @@ def _cell(values: list[float], share: bool) -> str:
     """Returns the mean of values, and their range if they differ."""
     if not values:
         return "-"
-    show = (lambda v: percent(v, surely=False)) if share else "{:.3g}".format
-    text, ends = show(float(np.mean(values))), (show(min(values)), show(max(values)))
-    return text if ends[0] == ends[1] else f"{text} ({ends[0]} to {ends[1]})"
+    show = partial(percent, surely=False) if share else "{:.3g}".format
+    return spread(float(np.mean(values)), (min(values), max(values)), show)
 
 
 def tried_table(compared: Compared) -> Table | None:
@@ -83,7 +83,12 @@ def tried_table(compared: Compared) -> Table | None:
             taken = f"{chosen} of {len(won)}"
             rows.append([of[0].title, label, _cell(won, True), taken])
     headings = ("alternative", "setting", "won when it was chosen", "taken, seeds")
-    return Table(f"{compared.task}: settings that were tried", headings, rows) if rows else None
+    note = (
+        "The share of the winnable starts that each setting wins in the game, or of other starts under a "
+        "short attack: the best setting is taken."
+    )
+    title = f"{compared.task}: settings that were tried"
+    return Table(title, headings, rows, note) if rows else None
 
 
 def sentences(compared: Compared) -> Iterator[str]:
@@ -93,14 +98,14 @@ def sentences(compared: Compared) -> Iterator[str]:
         best = others[0]
         title = compared.of(best)[0].title
         wins, hyrl = (f"{100 * _middle(compared, n, 'worst'):.2f}%" for n in (best, "hyrl"))
-        value, interval = compared.difference(best, "worst")
-        between = ""
-        if interval is not None:
-            low, high = (f"{100 * end:+.2f}" for end in interval)
+        mean, between = compared.difference(best, "worst"), ""
+        if mean.interval is not None and np.ptp(mean.interval):
+            low, high = (f"{100 * end:+.2f}" for end in mean.interval)
             between = f" (95% interval {low} to {high})"
-        word = "as many" if not value else f"{100 * abs(value):.2f} percentage points "
-        if value:
-            word += "more" if value > 0 else "less"
+        word = "as many"
+        if mean.value:
+            more = "more" if mean.value > 0 else "less"
+            word = f"{100 * abs(mean.value):.2f} percentage points {more}"
         yield (
             f"The best alternative is {title}, which wins from {wins} of the starts under attack; HyRL wins "
             f"from {hyrl}, {word}{between}."

@@ -4,19 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from markupsafe import Markup
+
 from hyrl_mj.errors import NoRenderer
 from hyrl_mj.judging.game import Robustness
 from hyrl_mj.runs.directory import Run
 from hyrl_mj.simulation import HybridArc
+from hyrl_mj.viz import pages
 from hyrl_mj.viz.commands import beginning
+from hyrl_mj.viz.figures.style import task_title
 from hyrl_mj.viz.options import ReplayOptions
 from hyrl_mj.viz.replay import Show, render_replay
-from hyrl_mj.viz.report import about, fill, film, pictures, write
+from hyrl_mj.viz.report import NO_VIDEO, against_noise, capital
 from hyrl_mj.viz.shows import replay_floor
 
 # In the run directory: the page, and the folder with its pictures and data.
 PAGE, FOLDER = "diagnosis.html", "diagnosis"
 REPLAY = ReplayOptions(size=(960, 720))  # of the policy alone
+NO_SPLIT = (
+    "Without a critical set there is nothing to split: to robustify this policy is to train one policy under "
+    "noise."
+)
+GOES_ON = "The same run directory then gets a policy for each way, joined with hysteresis:"
 
 
 def write_worst(run: Run, arc: HybridArc | None, say: Callable[[str], None]) -> None:
@@ -43,15 +52,34 @@ def write_page(run: Run, robustness: Robustness, arc: HybridArc | None, results:
         BadArtifact: a picture on it is damaged.
         BadInput: it cannot be written.
     """
-    folder = run.path / FOLDER
-    text = fill(
-        "diagnosis.html",
-        run.path,
-        **about(run, robustness),
-        sentences=results,
-        arc=arc,
-        video=film(folder / "worst.mp4"),
-        pictures=pictures(folder),
-        command=beginning(run, run.path),
+    task, folder, agent = run.task, run.path / FOLDER, run.agent
+    parts: list[pages.Part] = [[f"{capital(result)}." for result in results]]
+    if not len(run.critical_set.points):
+        parts.append(pages.paragraph(NO_SPLIT))
+    if arc is not None:
+        caption = (
+            f"The policy from {task.chart.format(arc.z[0])} under {arc.noise} noise, in real time. The "
+            "signal and the run are in diagnosis/worst.npz."
+        )
+        name = f"Replay of the policy under {arc.noise} noise"
+        parts.append(pages.film(folder / "worst.mp4", name, caption) or NO_VIDEO)
+    figures = pages.pictures(folder)
+    sections: list[pages.Section] = [
+        ("Results", parts),
+        (
+            "Figures",
+            figures or [pages.missing("A chart of this kind cannot be drawn in the plane.")],
+        ),
+        ("Tables", against_noise(run, robustness)),
+        ("How to go on", [pages.paragraph(GOES_ON), pages.code(beginning(run, run.path))]),
+    ]
+    title, name = task_title(task), pages.name_of(run.path)
+    text = pages.fill(
+        heading=f"{title}: what noise does to {agent}",
+        title=f"{title}: a diagnosis",
+        subtitle=Markup(
+            "What noise of up to {} {} on what it measures does to <b>{}</b>. Run <b>{}</b>."
+        ).format(run.settings.eps, task.noise_on()[1], agent, name),
+        sections=sections,
     )
-    write(run.path / PAGE, text)
+    pages.write(run.path / PAGE, text)

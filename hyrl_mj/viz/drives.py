@@ -25,8 +25,7 @@ from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks import LEFT, RIGHT, Field
 from hyrl_mj.viz.options import USUAL, ReplayOptions
 from hyrl_mj.viz.replay import Show, check_replay, render_replay
-from hyrl_mj.viz.tables import NAMES, Table
-from hyrl_mj.viz.terminal import print_table
+from hyrl_mj.viz.tables import NAMES, Table, print_table
 
 # The controllers with columns of their own, and panes in a replay.
 SHOWN = ("policy", "hyrl")

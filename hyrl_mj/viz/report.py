@@ -1,44 +1,32 @@
-"""The report of all results of a run, and what its pages share: pictures and videos as data URIs."""
+"""The report of all results of a run."""
 
 from __future__ import annotations
 
-import os
-from base64 import b64encode
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, is_dataclass, replace
+from collections.abc import Mapping
+from dataclasses import is_dataclass
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
-from PIL import Image
+from markupsafe import Markup
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.files import artifacts
 from hyrl_mj.judging import POLICIES, listed
 from hyrl_mj.judging.game import MapClass, Robustness
 from hyrl_mj.learning import Training
 from hyrl_mj.policies import Agent, MlpPolicy
 from hyrl_mj.runs.arcs import attack_replay
 from hyrl_mj.runs.directory import Run
-from hyrl_mj.viz import tables
+from hyrl_mj.viz import pages, tables
 from hyrl_mj.viz.commands import changed, commands
-from hyrl_mj.viz.figures import CLASS_COLOURS, FIGURES
+from hyrl_mj.viz.figures import CLASS_COLOURS
 from hyrl_mj.viz.figures.style import task_title
 
-# The largest picture and video that a page shows [bytes]: there they take several times the memory.
-PICTURE, VIDEO = 2**22, 2**25
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A PNG: its name, the file as a data URI, size [pixels] and caption; of a poster also the video."""
-
-    name: str
-    data: str
-    width: int
-    height: int
-    caption: str
-    video: str = ""
+FILM = "Replay of the policy and HyRL, side by side"
+NO_VIDEO = pages.missing(
+    "There is no video of the replay, for which an off-screen renderer and ffmpeg are needed. What this "
+    "machine lacks tells",
+    "hyrl-mj doctor",
+)
 
 
 def write_report(run: Run, path: Path) -> None:
@@ -52,7 +40,7 @@ def write_report(run: Run, path: Path) -> None:
     """
     if path.suffix != ".html":
         raise BadInput(f"a report is an html, {path} is not: give a name that ends in .html")
-    write(path, render(run))
+    pages.write(path, render(run))
 
 
 def render(run: Run) -> str:
@@ -65,23 +53,38 @@ def render(run: Run) -> str:
     stages = run.settings.stage1, run.settings.stage6
     options = [stage.options if isinstance(stage, Training) else {} for stage in stages]
     first, sixth = (_texts(vars(s) | more) for s, more in zip(stages, options, strict=True))
-    return fill(
+    title, s, unit = task_title(task), run.settings, task.noise_on()[1]
+    where = Markup("{}. Run <b>{}</b>, noise {} {}, seed {}, preset {}.").format(
+        capital(task.description), name := pages.name_of(run.path), s.eps, unit, s.seed, s.preset
+    )
+    return pages.fill(
         "report.html",
-        run.path,
-        **about(run, robustness),
+        heading=f"{title}: Hysteresis-Based RL, run {name}",
+        title=title,
+        subtitle=where,
+        run=run,
+        task=task,
+        settings=s,
+        critical=run.critical_set,
+        unit=unit,
+        tables=tables,
+        robustness=robustness,
+        game=robustness.game if robustness else None,
+        deciding=robustness.deciding if robustness else None,
+        capital=capital,
         modes=[task.mode_name(q) for q in run.controller.modes],
         listed=listed,
         worst=task.noise_on(bool(robustness and robustness.everywhere)),
-        video=film(run.path / "replay.mp4", has),
-        pictures=pictures(run.path / "figures", has),
+        film=pages.film(run.path / "replay.mp4", FILM, _film_caption(run), has) or NO_VIDEO,
+        pictures=pages.pictures(run.path / "figures", has),
         arrivals={who: tables.arrivals(run, arcs, who == "policy") for who in ("policy", "hyrl")}
         if arcs
         else None,
-        attacked=bool(attack_replay(run)),
         verdict=run.verdict if robustness and all(map(has, facts)) else None,
+        against_noise=against_noise(run, robustness),
         replays=arcs and tables.replay_table(run, arcs),
-        stages=_stages(run, robustness, arcs),
-        table=_texts(vars(run.settings)),
+        stages=_stages(run),
+        table=_texts(vars(s), {"eps": unit, "horizon": "s"}),
         training=[(name, first.get(name, ""), sixth.get(name, "")) for name in first | sixth],
         commands=commands(run, robustness),
         changed=changed(run),
@@ -89,13 +92,46 @@ def render(run: Run) -> str:
     )
 
 
+def _film_caption(run: Run) -> str:
+    """Returns what the replay shows."""
+    shown = "The learned policy (left) and HyRL (right) from the same start"
+    if attack_replay(run):
+        return f"{shown}, in real time, each under the strongest noise that the attack found against it."
+    noise = "each under the strongest noise that is known for it"
+    return (
+        f"{shown}{' on the critical set' * bool(len(run.critical_set.points))}, in real time, "
+        f"{noise if run.exact else 'under the same alternating noise'}"
+        f"{', once for each start mode of HyRL' * (len(run.controller.modes) > 1)}."
+    )
+
+
+def against_noise(run: Run, robustness: Robustness | None) -> list[pages.Part]:
+    """Returns the tables of what noise can do, and why some are missing."""
+    if robustness is None:
+        cure = "hyrl-mj robustness RUN"
+        return [pages.missing("It has not been examined yet what noise can do:", cure)]
+    found: list[pages.Part] = [*tables.robustness_tables(run.task, robustness)]
+    if robustness.game is not None:
+        return found
+    if why := run.why_no_game:
+        said = pages.missing(f"Noisy episodes stand in for the worst case, because {why}.")
+    else:
+        said = pages.missing(
+            "The worst case has not been played yet. It comes with", "hyrl-mj robustness RUN"
+        )
+    return [said, *found]
+
+
+def capital(sentence: str) -> str:
+    """Returns a sentence with a capital letter."""
+    return f"{sentence[:1].upper()}{sentence[1:]}"
+
+
 # ---- stages and settings
 
 
-def _stages(
-    run: Run, robustness: Robustness | None, arcs: tables.Arcs | None
-) -> list[tuple[str, str]]:
-    """Returns the result of each stage in a sentence."""
+def _stages(run: Run) -> list[tuple[str, str]]:
+    """Returns the results of the stages that make the controller in a sentence each."""
     task, s, modes = run.task, run.settings, run.extended_sets.modes
     reach = "; ".join(f"mode {task.mode_name(q)}: {tables.extent(run, q)}" for q in modes)
     attempts = f"up to {s.stage6.attempts} times " if s.stage6.attempts > 1 else ""
@@ -117,15 +153,12 @@ def _stages(
         ("partition", run.partition.sentence(task, run.settings.ways)),
         ("extended-sets", f"{run.extended_sets.sentence(task)}; {reach}"),
         ("retrain", retrained),
-        (
-            "robustness",
-            "not done" if robustness is None else tables.robustness_sentence(robustness),
-        ),
-        ("simulate", "not done" if arcs is None else tables.replay_sentence(run, arcs)),
     ]
 
 
-def _texts(settings: Mapping[str, object]) -> dict[str, str]:
+def _texts(
+    settings: Mapping[str, object], units: Mapping[str, str] = MappingProxyType({})
+) -> dict[str, str]:
     """Returns the texts of settings by their names in words, without trainings, agents and options.
 
     The settings of a group stand one by one.
@@ -136,86 +169,15 @@ def _texts(settings: Mapping[str, object]) -> dict[str, str]:
             plain |= {f"{name}: {field}": one for field, one in vars(value).items()}
         elif not isinstance(value, Training | Agent | Mapping):
             plain[name] = value
-    return {name.replace("_", " "): _text(value) for name, value in plain.items()}
+    return {
+        name.replace("_", " "): _text(value, units.get(name, "")) for name, value in plain.items()
+    }
 
 
-def _text(value: object) -> str:
-    """Returns the text of a setting."""
+def _text(value: object, unit: str) -> str:
+    """Returns the text of a setting, a number with its unit."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, tuple):
         return ", ".join(map(str, value))
-    return "by default" if value is None else f"{value}"
-
-
-# ---- what pages share
-
-
-def write(path: Path, text: str) -> None:
-    """Writes a page, whole or not at all."""
-    with artifacts.replacing(path) as temporary:
-        # The name of a folder may have bytes that are no characters.
-        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
-
-
-def fill(template: str, folder: Path, **values: Any) -> str:
-    """Returns a page from its template, which escapes what it fills in."""
-    environment = Environment(
-        loader=PackageLoader("hyrl_mj.viz"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    # A name that is not Unicode must not keep the page from being written.
-    name = os.fsencode(folder.resolve().name).decode("utf-8", "replace")
-    return environment.get_template(template).render(name=name, **values)
-
-
-def about(run: Run, robustness: Robustness | None) -> dict[str, Any]:
-    """Returns the values that every page of a run shows."""
-    return {
-        "title": task_title(run.task),
-        "run": run,
-        "task": run.task,
-        "settings": run.settings,
-        "critical": run.critical_set,
-        "unit": run.task.noise_on()[1],
-        "tables": tables,
-        "robustness": robustness,
-        "game": robustness.game if robustness else None,
-        "episodes": robustness.episodes if robustness else (),
-    }
-
-
-def film(path: Path, has: Callable[[Path], bool] = Path.is_file) -> Picture | None:
-    """Returns the poster of a replay with its video, or None unless both files can be shown."""
-    poster = path.with_suffix(".png")
-    if not (_fits(path, VIDEO, has) and _fits(poster, PICTURE, has)):
-        return None
-    return replace(_picture(poster, "replay", ""), video=data_uri(path.read_bytes(), "video/mp4"))
-
-
-def pictures(folder: Path, has: Callable[[Path], bool] = Path.is_file) -> list[Picture]:
-    """Returns the figures in a folder that can be shown."""
-    return [
-        _picture(path, name.replace("_", " "), entry.caption)
-        for name, entry in FIGURES.items()
-        if _fits(path := folder / f"{name}.png", PICTURE, has)
-    ]
-
-
-def _fits(path: Path, most: int, has: Callable[[Path], bool]) -> bool:
-    """Returns whether a file can be shown, and is no larger than so many bytes."""
-    return has(path) and path.stat().st_size <= most
-
-
-def _picture(path: Path, name: str, caption: str) -> Picture:
-    with artifacts.reading(path), Image.open(path, formats=("PNG",)) as image:
-        image.verify()
-        return Picture(name, data_uri(path.read_bytes(), "image/png"), *image.size, caption)
-
-
-def data_uri(content: bytes, kind: str) -> str:
-    """Returns the content of a file as a data URI."""
-    return f"data:{kind};base64,{b64encode(content).decode()}"
+    return "by default" if value is None else f"{value} {unit}".rstrip()

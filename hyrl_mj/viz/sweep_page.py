@@ -3,51 +3,65 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from io import BytesIO
 from itertools import chain
 from pathlib import Path
 from urllib.parse import quote
 
 import numpy as np
-from matplotlib import style as matplotlib_style
+from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from PIL import Image
 
 from hyrl_mj.judging.game import Curve
 from hyrl_mj.runs.directory import load_run
 from hyrl_mj.runs.improvement import LEAST_SEEDS, profile
-from hyrl_mj.runs.sweeps import Row, Setting, Sweep
-from hyrl_mj.viz import colours, sweep_tables as tables
+from hyrl_mj.runs.sweeps import Setting, Sweep
+from hyrl_mj.viz import colours, pages, sweep_tables as tables
 from hyrl_mj.viz.figures import style
-from hyrl_mj.viz.report import Picture, data_uri, fill, write
+from hyrl_mj.viz.pages import Picture
 
 
 def write_page(sweep: Sweep, folder: Path) -> None:
     """Writes `sweep.html` into the folder of a sweep."""
-    groups = sweep.groups()
-    page = fill(
-        "sweep.html",
-        folder,
-        common=sweep.common,
-        summary=(summary := tables.summary_table(sweep)),
-        markdown=tables.markdown(summary),
-        improved=tables.improvement_table(sweep),
-        pictures=[*_pictures(sweep, folder)],
-        groups=[
-            (setting, tables.run_table(rows), _links(rows), tables.worst(rows))
-            for setting, rows in groups.items()
-        ],
-        open_rows=[row for row in sweep.rows if not row.done],
-        done=sum(row.done for row in sweep.rows),
-        total=len(sweep.rows),
+    summary, improved = tables.summary_table(sweep), tables.improvement_table(sweep)
+    more = [] if improved is None else [improved]
+    sections: list[pages.Section] = [
+        ("Over the seeds", [summary, *more, *_pictures(sweep, folder)])
+    ]
+    if left := [f"{row.name}: {row.sentence or row.state}" for row in sweep.rows if not row.done]:
+        sections.append(("Runs that are not done", [left]))
+    sections.append(("The runs", [*_runs(sweep)]))
+    common, name = sweep.common, pages.name_of(folder)
+    of = [f"preset {common.preset}"]
+    of += [] if common.horizon is None else [f"horizon {common.horizon} s"]
+    of += [f"{setting} = {value}" for setting, value in common.set.items()]
+    page = pages.fill(
+        heading=f"Hysteresis-Based RL, sweep {name}",
+        title=f"Sweep {name}",
+        subtitle=f"{sum(row.done for row in sweep.rows)} of {len(sweep.rows)} runs are done, "
+        f"{', '.join(of)}.",
+        sections=[*sections, pages.to_paste(summary)],
     )
-    write(folder / "sweep.html", page)
+    pages.write(folder / "sweep.html", page)
 
 
-def _links(rows: list[Row]) -> dict[str, str]:
-    """Returns the addresses of the reports of the finished runs, by name."""
-    return {row.name: f"{quote(row.name)}/report.html" for row in rows if row.done}
+def _runs(sweep: Sweep) -> Iterator[pages.Part]:
+    """Yields a table of the runs of each setting, and links to their reports."""
+    for rows in sweep.groups().values():
+        yield tables.run_table(rows)
+        links = {
+            row.name: Markup('<a href="{}/report.html">{{}}</a>').format(quote(row.name))
+            for row in rows
+            if row.done
+        }
+        if (worst := tables.worst(rows)) is not None:
+            link = links[worst.name].format(f"that of seed {worst.seed}")
+            yield Markup("<p>The worst run is {}: {}, {}.</p>").format(
+                link, worst.verdict, worst.sentence
+            )
+        if len(links) > 1:
+            seeds = [link.format(name.rpartition("-")[2]) for name, link in links.items()]
+            yield Markup("<p>Reports by seed: {}.</p>").format(Markup(", ").join(seeds))
 
 
 def _pictures(sweep: Sweep, folder: Path) -> Iterator[Picture]:
@@ -58,28 +72,19 @@ def _pictures(sweep: Sweep, folder: Path) -> Iterator[Picture]:
         if game is not None:
             curves.setdefault(row.setting, []).append(game.curve)
     if curves:
-        yield as_picture(
+        yield pages.as_picture(
             "curves",
             draw_curves(curves),
             "What is won of the winnable starts against the worst noise of up to a bound: the line is the "
             "median over the seeds, the band reaches from the least to the greatest.",
         )
     if (profiles := draw_profiles(sweep)) is not None:
-        yield as_picture(
+        yield pages.as_picture(
             "profiles",
             profiles,
             "Performance profiles: the share of the runs of the sweep, over all settings and seeds, in which "
             "a controller wins at least so much.",
         )
-
-
-def as_picture(name: str, figure: Figure, caption: str) -> Picture:
-    """Returns a figure as a picture of a page."""
-    content = BytesIO()
-    figure.savefig(content, format="png", dpi=style.DPI, bbox_inches="tight", pad_inches=style.PAD)
-    with Image.open(content) as image:
-        size = image.size
-    return Picture(name, data_uri(content.getvalue(), "image/png"), *size, caption)
 
 
 def draw_profiles(sweep: Sweep) -> Figure | None:
@@ -90,8 +95,7 @@ def draw_profiles(sweep: Sweep) -> Figure | None:
     shown = {name: shares for name, shares in found.items() if len(shares) == 2}
     if not shown or sum(row.done for row in sweep.rows) < LEAST_SEEDS:
         return None
-    with matplotlib_style.context(["default", style.STYLE]):
-        figure = Figure(figsize=(style.WIDTH, 3.2), layout="constrained")
+    with style.plotting(3.2) as figure:
         panels = figure.subplots(1, len(shown), squeeze=False, sharey=True).ravel()
         for panel, (name, shares) in zip(panels, shown.items(), strict=True):
             for who, label, colour in (
@@ -99,11 +103,10 @@ def draw_profiles(sweep: Sweep) -> Figure | None:
                 ("hyrl", "HyRL", colours.MODES[0]),
             ):
                 panel.plot(100 * thresholds, 100 * shares[who], color=colour, label=label)
-            panel.set(xlim=(0, 100), ylim=(0, 102), xlabel=f"{tables.FIGURES[name][0]} [%]")
-            style.grid_lines(panel)
-            panel.spines[["top", "right"]].set_visible(False)
+            panel.set(
+                xlim=(0, 100), ylim=(0, 102), xlabel=f"{''.join(tables.FIGURES[name][:2])} [%]"
+            )
         panels[0].set_ylabel("runs with at least so much [%]")
-        style.legend(figure, handlelength=3.2)
     return figure
 
 
@@ -111,8 +114,7 @@ def draw_curves(curves: dict[Setting, list[Curve]]) -> Figure:
     """Draws a panel for each setting, with a band over its seeds for each controller."""
     columns = min(len(curves), style.COLUMNS)
     count = -(-len(curves) // columns)
-    with matplotlib_style.context(["default", style.STYLE]):
-        figure = Figure(figsize=(style.WIDTH, 0.8 + 2.7 * count), layout="constrained")
+    with style.plotting(0.8 + 2.7 * count) as figure:
         panels = figure.subplots(count, columns, squeeze=False, sharey=True).ravel()
         for panel, (setting, group) in zip(panels, curves.items(), strict=False):
             _draw(panel, group)
@@ -125,7 +127,6 @@ def draw_curves(curves: dict[Setting, list[Curve]]) -> Figure:
             panel.set_visible(False)
         for panel in panels[::columns]:
             panel.set_ylabel("winnable starts won [%]")
-        style.legend(figure, handlelength=3.2)
     return figure
 
 
@@ -145,5 +146,3 @@ def _draw(panel: Axes, curves: list[Curve]) -> None:
         median = np.median(shares, axis=0)
         panel.plot(eps, median, color=colour, linestyle=dashes, linewidth=1.8, label=label)
     panel.set(ylim=(0, 102), xlim=(0, eps[-1]))
-    style.grid_lines(panel)
-    panel.spines[["top", "right"]].set_visible(False)

@@ -1,22 +1,19 @@
-"""The results of a sweep as tables, for its page and the terminal.
-
-Only `summary` would be pandas' work: the rest is the text of each figure, and cells that hold no Markdown.
-"""
+"""The results of a sweep as tables, for its page and the terminal."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
+import numpy as np
+
 from hyrl_mj.errors import counted
 from hyrl_mj.judging.game import percent
-from hyrl_mj.runs.improvement import Mean, improvements
-from hyrl_mj.runs.sweeps import Row, Sweep, summary
+from hyrl_mj.runs.improvement import COMPARED, Mean, improvements
+from hyrl_mj.runs.sweeps import Row, Sweep
 from hyrl_mj.simulation import KINDS
-from hyrl_mj.viz.tables import NAMES, Table
-from hyrl_mj.viz.terminal import print_table
+from hyrl_mj.viz.tables import NAMES, Table, print_table, spread
 
 
 @dataclass(frozen=True)
@@ -35,52 +32,48 @@ class Column:
 
 
 # The texts of numbers, and of shares that are not proved.
-_number, _seconds, _tried = "{:.3g}".format, "{:.2f} s".format, partial(percent, surely=False)
-# The headings of how often a controller arrives, by the figure of each kind of noise.
-_ARRIVES = {
-    f"reached_{kind}": f"arrives, {'no' if kind == 'none' else kind} noise" for kind in KINDS
+_number, _tried = "{:.3g}".format, partial(percent, surely=False)
+# Figures that both controllers have: the heading, what that of HyRL ends with, and the text of a value.
+FIGURES: dict[str, tuple[str, str, Callable[[float], str]]] = {
+    "proved": ("proved", ", own q0", percent),
+    "not_broken": ("not broken", ", own q0", _tried),
+    "margin": ("margin", "", _number),
+    **{
+        f"reached_{kind}": (f"arrives, {'no' if kind == 'none' else kind} noise", "", percent)
+        for kind in KINDS
+    },
+    "withstood_attack": ("not lost under attack", "", _tried),
+    "lost_without_noise": ("lost without noise", "", percent),
+    "late": ("late", "", percent),
+    "longest": ("time relative to that without noise, 99%", "", _number),
 }
+
+
+def _both(*names: str) -> dict[str, Column]:
+    """Returns the columns of figures that both controllers have."""
+    columns = {}
+    for name in names:
+        heading, own, show = FIGURES[name]
+        columns[f"policy_{name}"] = Column(f"{NAMES['policy']} {heading}", show)
+        least = COMPARED.get(name, False)
+        columns[f"hyrl_{name}"] = Column(f"{NAMES['hyrl']} {heading}{own}", show, least)
+    return columns
+
+
 # The figures in tables, the most important first: by these the worst run is found.
 COLUMNS = {
     "open": Column("open starts", percent),
     "winnable": Column("winnable starts", percent),
-    "policy_proved": Column("RL policy proved", percent),
-    "policy_not_broken": Column("RL policy not broken", _tried),
-    "hyrl_proved": Column("HyRL proved, own q0", percent, True),
-    "hyrl_not_broken": Column("HyRL not broken, own q0", _tried, True),
+    **_both("proved", "not_broken"),
     "hyrl_proved_any": Column("HyRL proved, any q0", percent, True),
     "hyrl_not_broken_any": Column("HyRL not broken, any q0", _tried, True),
     "limit_won_any": Column("limit, any q0", percent),
-    "policy_margin": Column("RL policy, margin", _number),
-    "hyrl_margin": Column("HyRL, margin", _number, True),
-    "hyrl_proved_time": Column("latest arrival proved, own q0", _seconds),
-    "hyrl_proved_time_any": Column("latest arrival proved, any q0", _seconds, False),
+    **_both("margin"),
+    "hyrl_proved_time": Column("latest arrival proved, own q0", "{:.2f} s".format),
+    "hyrl_proved_time_any": Column("latest arrival proved, any q0", "{:.2f} s".format, False),
     "hyrl_excursion": Column("excursion", _number, False),
     "hyrl_miss_without_noise": Column("HyRL off the set-point, no noise", _number, False),
-} | {
-    f"{who}_{name}": Column(f"{NAMES[who]} {heading}", percent, True if who == "hyrl" else None)
-    for who in ("policy", "hyrl")
-    for name, heading in _ARRIVES.items()
-}
-COLUMNS |= {
-    f"{who}_{name}": Column(f"{NAMES[who]} {heading}", show, least if who == "hyrl" else None)
-    for name, heading, show, least in (
-        ("withstood_attack", "not lost under attack", _tried, True),
-        ("lost_without_noise", "lost without noise", percent, False),
-        ("late", "late", percent, False),
-        ("longest", "time, 99%", _number, False),
-    )
-    for who in ("policy", "hyrl")
-}
-# The headings of figures that both controllers have.
-FIGURES: dict[str, tuple[str, Callable[[float], str]]] = {
-    "proved": ("proved, own q0", percent),
-    "not_broken": ("not broken, own q0", _tried),
-    "margin": ("margin", _number),
-    **{name: (heading, percent) for name, heading in _ARRIVES.items()},
-    "withstood_attack": ("not lost under attack", _tried),
-    "late": ("late", percent),
-    "longest": ("time relative to that without noise, 99%", _number),
+    **_both(*list(FIGURES)[3:]),
 }
 
 
@@ -101,7 +94,7 @@ def summary_table(sweep: Sweep) -> Table:
     for name in shown(sweep.rows):
         values = [[row.figures.get(name) for row in group] for group in done.values()]
         rows.append([COLUMNS[name].heading, *(_cell(COLUMNS[name], own) for own in values)])
-    title = "median over the seeds (least to greatest)"
+    title = "median over the seeds (least to greatest where they differ)"
     return Table(title, ["figure", *(setting.title for setting in groups)], rows)
 
 
@@ -112,10 +105,10 @@ def improvement_table(sweep: Sweep) -> Table | None:
         return None
     rows = []
     for one in found:
-        heading, show = FIGURES[one.figure]
+        heading, own, show = FIGURES[one.figure]
         signed = (lambda v: f"{v:+.3g}") if show is _number else (lambda v: f"{100 * v:+.2f}%")
         row = {
-            "figure": heading,
+            "figure": heading + own,
             "runs": f"{one.runs}",
             "RL policy": _with_interval(one.policy, show),
             "HyRL": _with_interval(one.hyrl, show),
@@ -124,7 +117,11 @@ def improvement_table(sweep: Sweep) -> Table | None:
         }
         rows.append(row)
     title = "HyRL against the RL policy: means, 95% intervals (bootstrap over seeds and starts)"
-    return Table.of(title, rows)
+    note = (
+        "Over the seeds and settings; there are intervals where a setting has at least three seeds. The "
+        "probability is that a run of HyRL is better than one of the policy."
+    )
+    return Table.of(title, rows, note)
 
 
 def _with_interval(mean: Mean, show: Callable[[float], str]) -> str:
@@ -166,17 +163,6 @@ def worst(group: Iterable[Row]) -> Row | None:
     return min((row for row in group if row.done), key=goodness, default=None)
 
 
-def markdown(table: Table) -> str:
-    """Returns a table to paste as Markdown."""
-    lines = [_escaped(table.headings), ["---"] * len(table.headings), *map(_escaped, table.rows)]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
-def _escaped(cells: Iterable[object]) -> list[str]:
-    """Returns cells that hold no Markdown: no column, no link and no element of HTML."""
-    return [re.sub(r"([\\|\[\]<>`])", r"\\\1", str(cell)) for cell in cells]
-
-
 def print_sweep(sweep: Sweep) -> None:
     """Prints the summary, and the runs that are not done."""
     print_table(summary_table(sweep))
@@ -189,9 +175,9 @@ def print_sweep(sweep: Sweep) -> None:
 
 def _cell(column: Column, values: Sequence[float | None]) -> str:
     """Returns median, least and greatest of some figures, and of how many runs there is none."""
-    if (three := summary(values)) is None:
+    known = [value for value in values if value is not None]
+    if not known:
         return "-"
-    median, *ends = map(column.show, three)
-    text = median if ends[0] == ends[1] else f"{median} ({' to '.join(ends)})"
-    missing = sum(value is None for value in values)
+    text = spread(float(np.median(known)), (min(known), max(known)), column.show)
+    missing = len(values) - len(known)
     return f"{text}, none in {missing} of {counted(len(values), 'run')}" if missing else text

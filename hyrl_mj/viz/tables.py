@@ -1,9 +1,11 @@
-"""The results of a run as tables and sentences, for the report and the terminal."""
+"""The results of a run as tables and sentences, for pages and the terminal."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -45,16 +47,38 @@ class Ending:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of cells under a title and headings, one a column."""
+    """Rows of cells under a title and headings, one a column.
+
+    Below it stand on pages a note how to read it, and remarks everywhere.
+    """
 
     title: str
     headings: Sequence[str]
     rows: Sequence[Sequence[str | Ending]]
+    note: str = ""
+    remarks: Sequence[str] = ()
 
     @staticmethod
-    def of(title: str, rows: Sequence[Mapping[str, str]]) -> Table:
+    def of(title: str, rows: Sequence[Mapping[str, str]], *more: Any) -> Table:
         """Returns a table of rows that have the same headings, at least one."""
-        return Table(title, list(rows[0]), [list(row.values()) for row in rows])
+        return Table(title, list(rows[0]), [list(row.values()) for row in rows], *more)
+
+
+def markdown(table: Table) -> str:
+    """Returns a table to paste as Markdown."""
+    lines = [_escaped(table.headings), ["---"] * len(table.headings), *map(_escaped, table.rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _escaped(cells: Iterable[object]) -> list[str]:
+    """Returns cells that hold no Markdown: no column, no link and no element of HTML."""
+    return [re.sub(r"([\\|\[\]<>`])", r"\\\1", str(cell)) for cell in cells]
+
+
+def spread(middle: float, ends: Iterable[float], show: Callable[[float], str]) -> str:
+    """Returns a middle value with the least and the greatest, if these differ: "3 (1 to 4)"."""
+    low, high = map(show, ends)
+    return show(middle) if low == high else f"{show(middle)} ({low} to {high})"
 
 
 Arcs = Mapping[tuple[str, str], HybridArc]
@@ -78,7 +102,11 @@ def replay_table(run: Run, arcs: Arcs) -> Table:
         rows.append([f"{point} on M*" if start == "critical" else point, *endings])
     headings = [f"start ({', '.join(task.chart.names)}) in {units}", *columns.values()]
     noise = f"alternating noise {s.eps:g}{', on M* the strongest found' if run.exact else ''}"
-    return Table(f"{task.name}: {noise}, seed {s.seed}", headings, rows)
+    note = (
+        "Outcome, time, jumps from mode to mode, and last state; q0 is the mode that HyRL starts in. A run "
+        "that has reached its goal is marked good if it ended close to the set-point."
+    )
+    return Table(f"{task.name}: {noise}, seed {s.seed}", headings, rows, note)
 
 
 def _ending(task: Task, arc: HybridArc) -> Ending:
@@ -114,6 +142,26 @@ def replay_sentence(run: Run, arcs: Arcs) -> str:
 # ---- robustness
 
 
+def robustness_tables(task: Task, robustness: Robustness) -> list[Table]:
+    """Returns what noise can do: the worst-case game, noisy episodes, the attack, and both compared."""
+    tables = []
+    if game := robustness.game:
+        tables.append(score_table(task, game))
+        if not game.estimate:
+            tables.append(margin_table(task, game))
+        if game.sensed:
+            tables.append(sensed_table(task, game))
+        if game.replays:
+            tables.append(replays_table(task, game.replays))
+    if robustness.episodes:
+        tables.append(episode_table(task, robustness.episodes))
+    if robustness.attacks:
+        tables += [attack_table(task, robustness.attacks), signals_table(task, robustness.attacks)]
+    if robustness.comparisons and len(robustness.comparisons[0].lost) > 1:
+        tables.append(comparison_table(task, robustness.comparisons))
+    return tables
+
+
 def score_table(task: Task, game: GameResult) -> Table:
     """Returns the scores of the worst-case game: a row for each noise bound and controller."""
     where, unit = task.noise_on(game.everywhere)
@@ -141,7 +189,24 @@ def score_table(task: Task, game: GameResult) -> Table:
                 row[f"excursion [{unit}]"] = excursion_text(excursion)
             rows.append(row)
     estimated = ", an estimate" if game.estimate else ""
-    return Table.of(f"{task.name}: worst case over all noise signals{estimated}", rows)
+    spacing = " by ".join(f"{round(side, 5)}" for side in game.lattice.spacing)
+    units = ", ".join(dict.fromkeys(task.chart.units))
+    rounding = (
+        'Rounding makes this an estimate: "open" and "winnable" may be too much or too little. '
+    )
+    note = (
+        f'Played on a lattice of states, {spacing} {units} apart. "Open" is what one who sees the state can '
+        'win, "winnable" what this split can win by deciding the way from the measurement; the other shares '
+        'are of the winnable starts. "Proved" holds for every state between the nodes and for every noise '
+        'signal within the bound. "Not broken" is where no start is known that is lost: each start that '
+        "counts as lost was lost on the plant, with its noise signal."
+    )
+    remarks = [
+        f"Nothing is proved of {'the RL policy' if who == 'policy' else NAMES[who]}, because {why}."
+        for who, why in game.why_not_proved.items()
+    ]
+    title = f"{task.name}: worst case over all noise signals{estimated}"
+    return Table.of(title, rows, rounding * game.estimate + note, remarks)
 
 
 def proved_text(share: float | None) -> str:
@@ -177,7 +242,8 @@ def sensed_table(task: Task, game: GameResult) -> Table:
         }
         for who, score in game.sensed.items()
     ]
-    return Table.of(f"{task.name}: of all starts, under its sensor: {task.sensor}", rows)
+    note = "The worst case above is over all signals within a bound, which is more than the sensor can do."
+    return Table.of(f"{task.name}: of all starts, under its sensor: {task.sensor}", rows, note)
 
 
 def excursion_text(excursion: float | None) -> str:
@@ -206,7 +272,12 @@ def replays_table(task: Task, counts: Sequence[ReplayCount]) -> Table:
         rows.append(row)
     where, unit = task.noise_on(counts[0].everywhere)
     title = f"{task.name}: replays in MuJoCo, noise on {where} of up to {counts[0].eps:g} {unit}"
-    return Table.of(title, rows)
+    note = (
+        "The starts are proved, or no known noise beats them; they lie anywhere in their cells, the weakest "
+        'first, in each start mode. "Judged" are those that plain MuJoCo played once more, one by one, with '
+        "the same result at every sample. A single loss withdraws the words PROVED and WON."
+    )
+    return Table.of(title, rows, note)
 
 
 def episode_table(task: Task, counts: Sequence[EpisodeCount]) -> Table:
@@ -225,7 +296,8 @@ def episode_table(task: Task, counts: Sequence[EpisodeCount]) -> Table:
             "outcomes": outcomes,
         }
         rows.append(row)
-    return Table.of(f"{task.name}: noisy episodes", rows)
+    note = "With the 95% interval of the share that reached the set-point."
+    return Table.of(f"{task.name}: noisy episodes", rows, note)
 
 
 def attack_table(task: Task, counts: Sequence[AttackCount]) -> Table:
@@ -249,7 +321,12 @@ def attack_table(task: Task, counts: Sequence[AttackCount]) -> Table:
         }
         rows.append(row)
     title = f"{task.name}: attack, a search for noise on {where} of up to {counts[0].eps:g} {unit}"
-    return Table.of(title, rows)
+    note = (
+        "Half of the starts lie near the critical set. Every loss has been repeated with its recorded noise "
+        "signal. The interval is that of the share. That the attack finds nothing is no proof that there is "
+        "nothing."
+    )
+    return Table.of(title, rows, note)
 
 
 def signals_table(task: Task, counts: Sequence[AttackCount]) -> Table:
@@ -257,7 +334,10 @@ def signals_table(task: Task, counts: Sequence[AttackCount]) -> Table:
     kinds = dict.fromkeys(kind for count in counts for kind in count.tried)
     rows = [[kind, *(f"{count.tried.get(kind, 0):,}" for count in counts)] for kind in kinds]
     headings = ("signal", *(f"runs of {NAMES[count.controller]}" for count in counts))
-    return Table(f"{task.name}: signals that the attack tried", headings, rows)
+    note = (
+        "All are tried with the same rules; those about modes come on top for one that has several."
+    )
+    return Table(f"{task.name}: signals that the attack tried", headings, rows, note)
 
 
 def comparison_table(task: Task, comparisons: Sequence[Comparison]) -> Table:
@@ -278,7 +358,11 @@ def comparison_table(task: Task, comparisons: Sequence[Comparison]) -> Table:
         rows.append(row)
     names = " and ".join(NAMES[name] for name in comparisons[0].lost)
     title = f"{names} from the same starts; time and way are relative to those without noise"
-    return Table.of(f"{task.name}: {title}", rows)
+    note = (
+        "Under noise only starts are compared that both win without it. Late is a run that takes more than "
+        "twice its time without noise."
+    )
+    return Table.of(f"{task.name}: {title}", rows, note)
 
 
 def _both(values: Mapping[str, int | tuple[float, float]]) -> str:
@@ -287,13 +371,6 @@ def _both(values: Mapping[str, int | tuple[float, float]]) -> str:
         f"{v[0]:.2f} {v[1]:.2f}" if isinstance(v, tuple) else f"{v:,}" for v in values.values()
     ]
     return ("; " if any(isinstance(v, tuple) for v in values.values()) else ", ").join(texts)
-
-
-def attack_sentence(counts: Sequence[AttackCount]) -> str:
-    """Returns what the attack breaks in one line."""
-    return "the attack breaks " + ", ".join(
-        f"{NAMES[c.controller]} from {c.broken}" for c in counts
-    )
 
 
 def robustness_sentence(robustness: Robustness) -> str:
@@ -305,7 +382,8 @@ def robustness_sentence(robustness: Robustness) -> str:
             share = "all" if least == 1 else f"{percent(least)} or more of the"
             parts.append(f"{NAMES[who]} reaches in {share} episodes")
         if robustness.attacks:
-            parts.append(attack_sentence(robustness.attacks))
+            broken = (f"{NAMES[c.controller]} from {c.broken}" for c in robustness.attacks)
+            parts.append(f"the attack breaks {', '.join(broken)}")
         return ", ".join(parts)
     policy, hyrl = (robustness.deciding.scores[who][-1] for who in ("policy", "hyrl"))
     shares = [
@@ -372,3 +450,71 @@ def extent(run: Run, mode: int) -> str:
 def _point(z: np.ndarray) -> str:
     """Returns a chart point (d,), to a thousandth."""
     return f"({', '.join(f'{v + 0.0:.3f}' for v in np.round(z, 3))})"
+
+
+# ---- what commands print
+
+
+def print_summary(run: Run) -> None:
+    """Prints the verdict, and the results of policy and hybrid controller in replays and worst case."""
+    arcs = run.arcs()
+    print_verdict(run)
+    print_table(replay_table(run, arcs))
+    print(run.critical_set.sentence(run.task))
+    for q in run.extended_sets.modes:
+        print(f"mode {run.task.mode_name(q)}: {extent(run, q)}")
+    print(replay_sentence(run, arcs))
+    print_robustness(run)
+    print(f"run directory {run.path}")
+    for what, name in (("video", "replay.mp4"), ("report", "report.html")):
+        path = run.path / name
+        print(f"{what} {path}" if run.manifest.has(path) else f"no {what}")
+
+
+def print_verdict(run: Run) -> None:
+    """Prints the verdict with its reasons."""
+    print(run.verdict)
+    for reason in run.verdict.reasons:
+        print(f"- {reason}")
+
+
+def print_robustness(run: Run) -> None:
+    """Prints what noise can do."""
+    for table in robustness_tables(run.task, run.robustness):
+        print_table(table)
+
+
+def print_noise(noise: LogNoise) -> None:
+    """Prints the noise of a log: a table, what it does not tell, and the noise to give to a run."""
+    print_table(noise_table(noise))
+    for remark in (*noise.remarks, *(text for column in noise.columns for text in column.remarks)):
+        print(f"- {remark}")
+    if len({column.text for column in noise.columns}) > 1:
+        for column in noise.columns:
+            print(f"{column.name}: {column.text}")
+    print(f'hyrl-mj run TASK --noise "{noise.text}"')
+
+
+def print_table(table: Table) -> None:
+    """Prints a table, every cell whole; on a terminal too narrow for its words, a line for each cell."""
+    import rich.table  # slow to import, and --help does not need it
+    from rich.console import Console
+    from rich.measure import Measurement
+
+    drawn = rich.table.Table(*table.headings, title=table.title)
+    for row in table.rows:
+        drawn.add_row(*map(str, row))
+    # Off a terminal rich assumes 80 columns, which would cut the cells.
+    width = None if Console().is_terminal else 160
+    console = Console(width=width, markup=False, emoji=False, highlight=False)
+    wide = console.options.update(max_width=10_000)  # no table is wider
+    if Measurement.get(console, wide, drawn).minimum <= console.width:
+        console.print(drawn)
+    else:
+        print(table.title)
+        for row in table.rows:
+            print()
+            for heading, cell in zip(table.headings, row, strict=True):
+                print(f"{heading}: {cell}")
+    for remark in table.remarks:
+        print(remark)

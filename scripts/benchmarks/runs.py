@@ -21,16 +21,12 @@ class Runs:
     folder: Path
     preset: str
 
-    def path(self, task: str, seed: int = 0) -> Path:
-        """Of a finished run."""
-        path = self.folder / f"{task}_{seed}"
-        if not path.exists():
-            self.make(task, seed, path)
-        return path
-
     def load(self, task: str) -> Run:
         """A finished run."""
-        return hyrl_mj.load_run(self.path(task))
+        path = self.folder / f"{task}_0"
+        if not path.exists():
+            self.make(task, 0, path)
+        return hyrl_mj.load_run(path)
 
     def make(self, task: str, seed: int, path: Path) -> float:
         """Run the command; its peak memory [MB]."""
@@ -52,7 +48,7 @@ def child(arguments: list[str]) -> float:
     return peak
 
 
-def peak_memory(pid: int | str = "self") -> float:
+def peak_memory(pid: int) -> float:
     """The most that a process has had in memory so far [MB], on Linux.
 
     `ru_maxrss` would say that of the process that started it, if that is more.

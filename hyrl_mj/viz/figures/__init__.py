@@ -1,9 +1,8 @@
 """Figures of a run, drawn from the results of its stages.
 
-Each drawing function takes the value that it shows, and returns a matplotlib `Figure`. Given the path of a
-PNG it also writes the figure there, and a PDF beside it. All but runs, robustness map and curve raise
-`BadInput` for a chart that is neither a plane nor a ring. A new figure is a function in a module here and
-an entry of `FIGURES`.
+Each drawing function takes the value that it shows, and returns a matplotlib `Figure`. All but runs,
+robustness map and curve raise `BadInput` for a chart that is neither a plane nor a ring. A new figure is a
+function in a module here and an entry of `FIGURES`.
 """
 
 from collections.abc import Callable
@@ -14,6 +13,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from hyrl_mj.tasks import Task
+from hyrl_mj.viz.figures import style
 from hyrl_mj.viz.figures.charts import drawable
 from hyrl_mj.viz.figures.extended_sets import draw_extended_sets
 from hyrl_mj.viz.figures.policy import draw_overview, draw_policy_map
@@ -38,13 +38,13 @@ class Entry:
     """A figure that stages draw and reports show.
 
     Attributes:
-        draw: (shown, path or None) -> the figure.
+        draw: shown -> the figure.
         shows: the type that `draw` takes; the stage that makes such a value draws the figure.
         caption: one or two sentences for the report.
         flat: whether the figure needs a chart, or a section of it, that is a plane or a ring.
     """
 
-    draw: Callable[[Any, Path | None], Figure]
+    draw: Callable[[Any], Figure]
     shows: type[ShownPolicy | ShownGame]
     caption: str
     flat: bool = True
@@ -108,5 +108,5 @@ def draw_all(shown: ShownPolicy | ShownGame, folder: Path) -> tuple[str, ...]:
     if isinstance(shown, ShownGame) and shown.result.estimate:  # of a few bounds there is no curve
         drawn = tuple(name for name in drawn if name != "robustness_curve")
     for name in drawn:
-        FIGURES[name].draw(shown, folder / f"{name}.png")
+        style.write(FIGURES[name].draw(shown), folder / f"{name}.png")
     return drawn

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from hyrl_mj.viz.figures.shown import ShownRun
 CORE, GAP = 0.6, 0.05  # the inner radius of the innermost ring, and the gap between rings
 
 
-def draw_extended_sets(shown: ShownRun, path: Path | None = None) -> Figure:
+def draw_extended_sets(shown: ShownRun) -> Figure:
     """Draws the extended sets and their overlap; in a plane, with an enlargement around M*."""
     task, sets = shown.task, shown.sets
     charts.check_drawable(task)
@@ -29,7 +28,7 @@ def draw_extended_sets(shown: ShownRun, path: Path | None = None) -> Figure:
     shared = np.asarray(np.sum([members.mask for members in sets.sets], axis=0) > 1)
     ring = charts.is_ring(task.chart)
     enlarged = not ring and len(shown.critical.points) > 0 and sets.eps > 0
-    with style.drawing(path, 5.6, shown.section, title) as figure:
+    with style.drawing(5.6, shown.section, title) as figure:
         panels = figure.subplots(1, 1 + enlarged, squeeze=False).ravel()
         for i, mode in enumerate(sets.modes):
             label = f"{style.set_label(mode, extended=True)}, of mode {task.mode_name(mode)}"

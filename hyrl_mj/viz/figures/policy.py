@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
@@ -23,12 +21,12 @@ from hyrl_mj.viz.figures.shown import ShownPolicy
 from hyrl_mj.viz.tables import NAMED
 
 
-def draw_overview(shown: ShownPolicy, path: Path | None = None) -> Figure:
+def draw_overview(shown: ShownPolicy) -> Figure:
     """Draws the ways that the policy goes without noise, and a run that noise leads astray."""
     task, arc = shown.task, shown.noisy
     charts.check_drawable(task)
     title = f"the {shown.algorithm} policy, and where noise leads it"
-    with style.drawing(path, 7.6, shown.section, title) as figure:
+    with style.drawing(7.6, shown.section, title) as figure:
         panel = figure.subplots()
         panel.set_title(style.noise_label(task, arc.noise, arc.bound))
         for i, mode in enumerate(shown.partition.modes):
@@ -131,12 +129,12 @@ def _noisy_run(panel: Axes, shown: ShownPolicy, view: View) -> None:
 # ---- the map of the inputs
 
 
-def draw_policy_map(shown: ShownPolicy, path: Path | None = None) -> Figure:
+def draw_policy_map(shown: ShownPolicy) -> Figure:
     """Draws a map of each input of the policy, and the policy's runs from the scene's starts."""
     task, section = shown.task, shown.section
     charts.check_drawable(task)
     chart = section.chart
-    with style.drawing(path, 5.2, section, f"the {shown.algorithm} policy") as figure:
+    with style.drawing(5.2, section, f"the {shown.algorithm} policy") as figure:
         *maps, panel = figure.subplots(1, len(task.inputs) + 1)
         ring = charts.is_ring(chart)
         grid = Grid(chart, (720,)) if ring else Grid.with_cells(chart, 240)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -38,7 +37,7 @@ CURVES: dict[str, Looks] = {
 }  # fmt: skip
 
 
-def draw_robustness_map(shown: ShownGame, path: Path | None = None) -> Figure:
+def draw_robustness_map(shown: ShownGame) -> Figure:
     """Draws a map for each controller: what becomes of runs from each state."""
     task, result, maps = shown.task, shown.result, shown.maps
     section = shown.section
@@ -47,7 +46,7 @@ def draw_robustness_map(shown: ShownGame, path: Path | None = None) -> Figure:
     where, unit = task.noise_on(result.everywhere)
     estimated = ", an estimate" if result.estimate else ""
     title = f"the worst noise on {where} up to eps = {maps.eps:g} {unit}{estimated}"
-    with style.drawing(path, 1.6 + _panel_height(section.chart), section, title) as figure:
+    with style.drawing(1.6 + _panel_height(section.chart), section, title) as figure:
         panels = figure.subplots(1, len(names), squeeze=False).ravel()
         for k in np.unique(np.concatenate([maps.map[name] for name in names])):
             label = (
@@ -119,7 +118,7 @@ def _ring(panel: Axes, shown: ShownGame, grid: Grid, classes: np.ndarray) -> Non
 # ---- the curve
 
 
-def draw_robustness_curve(shown: ShownGame, path: Path | None = None) -> Figure:
+def draw_robustness_curve(shown: ShownGame) -> Figure:
     """Draws what each controller wins against the noise bound.
 
     Where runs last for ever, a second panel shows the worst time to arrival.
@@ -131,7 +130,7 @@ def draw_robustness_curve(shown: ShownGame, path: Path | None = None) -> Figure:
     where, unit = task.noise_on(result.everywhere)
     heights = (3.6, 2.0) if result.lasting else (3.6,)
     title = "what is won against the worst noise"
-    with style.drawing(path, 2.0 + sum(heights), shown.section, title) as figure:
+    with style.drawing(2.0 + sum(heights), shown.section, title) as figure:
         rows: Looks = {"nrows": len(heights), "height_ratios": heights}
         panels = figure.subplots(sharex=True, squeeze=False, **rows).ravel()
         shares = panels[0]
@@ -152,8 +151,7 @@ def draw_robustness_curve(shown: ShownGame, path: Path | None = None) -> Figure:
             panels[1].set_ylabel("worst time to arrival,\nnodes that are won [s]")
         for panel in panels:
             panel.axvline(run_eps, color=colours.INK, linewidth=1, linestyle=(0, (1, 2)), zorder=1)
-            style.grid_lines(panel)
-            panel.spines[["top", "right"]].set_visible(False)
+            style.open_panel(panel)
         limits = (0, 1.01 * max(eps[-1], run_eps))
         panels[-1].set(xlabel=f"noise bound eps on {where} [{unit}]", xlim=limits)
         note = f"this run: eps = {run_eps:g} {unit}"

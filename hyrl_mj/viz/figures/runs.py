@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -45,19 +44,14 @@ def plane_view(panel: Axes, section: Section) -> View:
     return View(lambda t, z: chart.wrap(z[..., :2]), longest)
 
 
-def time_view(panel: Axes, chart: Chart, coordinate: int) -> View:
-    """Makes a panel a coordinate over time."""
-    panel.set_xlabel("time [s]")
-    charts.label_axis(panel.yaxis, chart, coordinate)
-    style.grid_lines(panel)
-    return View(lambda t, z: np.stack([t, z[:, coordinate]], axis=1))
-
-
 def view_of(panel: Axes, section: Section, coordinate: int, flat: bool) -> View:
     """Makes a panel the plane of a section, or not `flat` a coordinate of the whole chart over time."""
     if flat:
         return plane_view(panel, section)
-    return time_view(panel, section.task.chart, coordinate)
+    panel.set_xlabel("time [s]")
+    charts.label_axis(panel.yaxis, section.task.chart, coordinate)
+    style.grid_lines(panel)
+    return View(lambda t, z: np.stack([t, z[:, coordinate]], axis=1))
 
 
 def spiral_view(chart: Chart, horizon: float) -> View:
@@ -159,7 +153,7 @@ def hybrid_way(panel: Axes, task: Task, view: View, arc: HybridArc, modes: Seque
         mark(panel, view, arc, row, "D", color=INK, markersize=3.5, zorder=7, label="jump")
 
 
-def draw_runs(shown: ShownRun, path: Path | None = None) -> Figure:
+def draw_runs(shown: ShownRun) -> Figure:
     """Draws the hybrid controller and the policy under the same noise, a column for each start mode.
 
     Of a chart with two coordinates the paths are shown in its plane, at most four beside each other; else
@@ -176,7 +170,7 @@ def draw_runs(shown: ShownRun, path: Path | None = None) -> Figure:
     noise = style.noise_label(task, first.noise, first.bound)
     title = f"HyRL and {policy_title}\nunder the same {noise}"
     thin = {"color": POLICY, "linewidth": 1.0, "zorder": 4}
-    with style.drawing(path, 1.6 + 3.4 * rows, task, title) as figure:
+    with style.drawing(1.6 + 3.4 * rows, task, title) as figure:
         panels = figure.subplots(rows, columns, sharex=True, sharey="row", squeeze=False)
         for (row, column), panel in np.ndenumerate(panels):
             coordinate, loop = (0, row * columns + column) if plane else (row, column)

@@ -50,11 +50,10 @@ def mode_tint(place: int) -> str:
 
 
 @contextmanager
-def drawing(path: Path | None, height: float, of: Task | Section, title: str) -> Iterator[Figure]:
-    """Gives a figure to draw on, and writes it as PNG and PDF when the block ends without an error.
+def drawing(height: float, of: Task | Section, title: str) -> Iterator[Figure]:
+    """Gives a figure to draw on.
 
     Args:
-        path: where the PNG is written, and the PDF beside it; None writes nothing.
         height: of the figure [inches], before empty margins are cut off.
         of: the title of the figure begins with the name of the task and, of a section, where that is.
         title: how the title of the figure goes on.
@@ -66,22 +65,44 @@ def drawing(path: Path | None, height: float, of: Task | Section, title: str) ->
         figure = Figure(figsize=(WIDTH, height), layout=layout)
         figure.suptitle(f"{task_title(task)}{where}: {title}", fontsize=12, fontweight="bold")
         yield figure
-        if path is None:
-            return
-        with (
-            artifacts.replacing(path.with_suffix(".png")) as png,
-            artifacts.replacing(path.with_suffix(".pdf")) as pdf,
-        ):
-            # Panels of a fixed aspect leave empty margins, which are cut off.
-            cut: dict[str, Any] = {"dpi": DPI, "bbox_inches": "tight", "pad_inches": PAD}
-            for file in (png, pdf):
-                content = (
-                    BytesIO()
-                )  # on a full disk the writer of PDFs fails with an error about itself
-                # Without the date the same figure is the same file.
-                metadata = {"CreationDate": None} if file is pdf else None
-                figure.savefig(content, format=file.suffix[1:], metadata=metadata, **cut)
-                file.write_bytes(content.getvalue())
+
+
+def write(figure: Figure, path: Path) -> None:
+    """Writes a figure as a PNG to a path, and as a PDF beside it; both or none."""
+    with (
+        artifacts.replacing(path.with_suffix(".png")) as png,
+        artifacts.replacing(path.with_suffix(".pdf")) as pdf,
+    ):
+        for file in (png, pdf):
+            # On a full disk the writer of PDFs fails with an error about itself.
+            content = BytesIO()
+            save(figure, content, file.suffix[1:])
+            file.write_bytes(content.getvalue())
+
+
+@contextmanager
+def plotting(height: float) -> Iterator[Figure]:
+    """Gives a figure of curves to draw on, without a title, whose legend is written at the end."""
+    with style.context(["default", STYLE]):
+        figure = Figure(figsize=(WIDTH, height), layout="constrained")
+        yield figure
+        for panel in figure.axes:
+            open_panel(panel)
+        legend(figure, handlelength=3.2)
+
+
+def save(figure: Figure, file: BytesIO, kind: str = "png") -> None:
+    """Writes a figure without the empty margins that panels of a fixed aspect leave, and without the date."""
+    metadata = {"CreationDate": None} if kind == "pdf" else None
+    cut: dict[str, Any] = {"dpi": DPI, "bbox_inches": "tight", "pad_inches": PAD}
+    with style.context(["default", STYLE]):
+        figure.savefig(file, format=kind, metadata=metadata, **cut)
+
+
+def open_panel(panel: Axes) -> None:
+    """Gives a panel of curves grid lines, and no frame above and at the right."""
+    grid_lines(panel)
+    panel.spines[["top", "right"]].set_visible(False)
 
 
 def grid_lines(panel: Axes) -> None:
