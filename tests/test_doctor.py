@@ -26,8 +26,7 @@ def test_versions_without_importing():
     code = (
         "import sys; from hyrl_mj.cli import doctor; lines, missing = doctor.versions();"
         "print(*lines, sep='\\n'); print('missing:', missing);"
-        "slow = {'torch', 'stable_baselines3', 'imageio_ffmpeg', 'matplotlib'};"
-        "print('imported:', slow & set(sys.modules))"
+        "print('imported:', {'torch', 'stable_baselines3', 'mediapy', 'matplotlib'} & set(sys.modules))"
     )
     child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     *lines, missing, imported = child.stdout.splitlines()

@@ -59,7 +59,7 @@ PROGRAMS = {
     "writes other things": (LAST + 'cat >/dev/null; echo film >"$last"', "left 5 bytes"),
     "removes the file": (LAST + 'cat >/dev/null; rm "$last"', "left no file"),
     "fails at the end": ("cat >/dev/null; echo disk full >&2; exit 1", "disk full"),
-    "is killed": ("cat >/dev/null; kill -9 $$", "status -9"),
+    "is killed": ("cat >/dev/null; kill -9 $$", "Error writing"),
     "never reads": ("exec sleep 600", "took no frame for 1 s"),
     "never reads, in a child": ("sleep 600; true", "took no frame for 1 s"),
     "leaves a child that never reads": ("exec 3<&0; sleep 9 <&3 & exit 0", "took no frame for 1 s"),

@@ -100,7 +100,7 @@ def test_a_saved_policy_works_without_torch(task, tmp_path):
 # Slow to import, and seldom needed.
 HEAVY = {
     "PIL", "hyrl_mj.viz.encoding", "hyrl_mj.physics.rendering", "hyrl_mj.viz.replay", "imageio_ffmpeg",
-    "jinja2", "matplotlib", "mujoco.batch", "pydantic", "rich", "scipy",
+    "jinja2", "matplotlib", "mediapy", "mujoco.batch", "pydantic", "rich", "scipy",
     "stable_baselines3", "tensorboard", "torch", "tqdm", "viser",
 }  # fmt: skip
 HELP = """

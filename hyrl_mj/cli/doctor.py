@@ -29,6 +29,7 @@ DISTRIBUTIONS = (
     "numpy",
     "scipy",
     "safetensors",
+    "mediapy",
     "imageio-ffmpeg",
     "pillow",
     "matplotlib",

@@ -367,7 +367,7 @@ def write_config(run: Run, versions: dict[str, str] | None = None) -> None:
     """Writes `config.json`: every setting, and the versions of Python and the packages, by default of now."""
     if versions is None:
         packages = (
-            "hyrl-mj", "mujoco", "gymnasium", "stable-baselines3", "torch", "numpy",
+            "hyrl-mj", "mujoco", "gymnasium", "stable-baselines3", "torch", "numpy", "mediapy",
         )  # fmt: skip
         versions = {name: version(name) for name in packages}
         versions["python"] = platform.python_version()

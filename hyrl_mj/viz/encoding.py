@@ -1,34 +1,40 @@
-"""Videos, written frame by frame by ffmpeg, with one clear message where that fails.
+"""Videos, written frame by frame by mediapy, with one clear message where that fails.
 
-ffmpeg may fail, or stop, at any moment, and a child of it may hold the pipe: who waits too long for it ends
-all of them.
+mediapy itself waits for ever for an ffmpeg that takes no frame, and does not see that a file is not whole.
+To kill ffmpeg does not end the wait, because a child of it may hold the pipe: so a thread of its own waits.
 """
 
 from __future__ import annotations
 
 import errno
 import os
+import queue
 import shutil
-import signal
-import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from threading import Timer
+from threading import Thread
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hyrl_mj.errors import NoRenderer, brief
 from hyrl_mj.files import artifacts
 
+if TYPE_CHECKING:
+    import mediapy
+
 # The time for which ffmpeg may neither take a frame nor write [s].
 PATIENCE = 30.0
 # How a video is encoded, by its suffix: H.264 as browsers play it, or a GIF. More threads slow the drawing.
-ENCODERS = {
-    ".mp4": "-vcodec h264 -pix_fmt yuv420p -vb 0 -crf 20 -preset veryfast -threads 2 "
-    "-sws_flags fast_bilinear -movflags +faststart",
-    ".gif": "-vcodec gif -pix_fmt pal8 -vf split[s0][s1];[s0]palettegen[p];[s1][p]paletteuse -f gif",
+ENCODERS: dict[str, dict[str, Any]] = {
+    ".mp4": {
+        "codec": "h264",
+        "crf": 20,
+        "ffmpeg_args": "-preset veryfast -threads 2 -sws_flags fast_bilinear -movflags +faststart",
+    },
+    ".gif": {"codec": "gif"},
 }
 
 
@@ -50,12 +56,18 @@ def video(
         BadInput: the path cannot be written.
         NoRenderer: ffmpeg is missing, failed, stopped, or left no whole video; the message says what to do.
     """
+    try:
+        import imageio_ffmpeg
+        import mediapy
+
+        mediapy.set_ffmpeg(imageio_ffmpeg.get_ffmpeg_exe())
+    except (ImportError, RuntimeError) as error:
+        raise _failed(path, brief(error)) from error
     with artifacts.replacing(path) as temporary:
-        try:
-            # ffmpeg takes what stands before a colon, as in a name of a folder, for a protocol.
-            encoder = Encoder(temporary.absolute(), width, height, fps)
-        except (ImportError, RuntimeError, OSError) as error:
-            raise _failed(path, brief(error)) from error
+        options = ENCODERS[path.suffix]
+        # ffmpeg takes what stands before a colon, as in a name of a folder, for a protocol.
+        place = temporary.absolute()
+        encoder = Encoder(mediapy.VideoWriter(place, (height, width), fps=fps, **options))
         try:
             yield encoder.add
             encoder.finish()
@@ -74,26 +86,19 @@ class EncodingFailed(Exception):
 
 
 class Encoder:
-    """An ffmpeg that writes a video, and is watched.
+    """A writer that is fed by a thread of its own, and watched: ffmpeg may fail, or stop, at any moment.
 
     Args:
-        path, width, height, fps: of the video.
-
-    Raises:
-        ImportError, RuntimeError, OSError: there is no ffmpeg, or it cannot be started.
+        writer: writes the video.
     """
 
-    def __init__(self, path: Path, width: int, height: int, fps: float):
-        import imageio_ffmpeg
-
-        frames = f"-f rawvideo -vcodec rawvideo -pix_fmt rgb24 -s {width}x{height} -r {fps} -i -"
-        options = f"-v error {frames} -an {ENCODERS[path.suffix]} -y".split()
-        self._path = path
-        # In a session of its own, its children can be ended with it.
-        self._process = subprocess.Popen(
-            [imageio_ffmpeg.get_ffmpeg_exe(), *options, str(path)],
-            stdin=subprocess.PIPE, stderr=subprocess.PIPE, bufsize=0, start_new_session=True,
-        )  # fmt: skip
+    def __init__(self, writer: mediapy.VideoWriter):
+        self._writer, self._problem = writer, ""
+        # One frame goes to the encoder while the next is drawn.
+        self._frames: queue.Queue[np.ndarray | None] = queue.Queue(1)
+        # No one waits for this thread, which can be held up for as long as ffmpeg lives.
+        self._feeding = Thread(target=self._feed, daemon=True)
+        self._feeding.start()
 
     def add(self, frame: np.ndarray) -> None:
         """Appends a frame (height, width, 3) uint8.
@@ -101,19 +106,7 @@ class Encoder:
         Raises:
             EncodingFailed: ffmpeg has ended, or takes no more frames.
         """
-        assert self._process.stdin is not None
-        left, since = memoryview(frame.tobytes()), time.monotonic()
-        watch = Timer(PATIENCE, self._kill)
-        watch.start()
-        try:
-            while left:
-                left = left[self._process.stdin.write(left) :]
-        except OSError as error:
-            if time.monotonic() >= since + PATIENCE:
-                raise EncodingFailed(f"ffmpeg took no frame for {PATIENCE:g} s") from error
-            raise EncodingFailed(self._said() or brief(error)) from error
-        finally:
-            watch.cancel()
+        self._put(frame.copy())
 
     def finish(self) -> None:
         """Waits until all frames are encoded.
@@ -121,41 +114,50 @@ class Encoder:
         Raises:
             EncodingFailed: ffmpeg failed, or makes no progress.
         """
-        assert self._process.stdin is not None
-        self._process.stdin.close()
+        self._put(None)
         size, since = -1, time.monotonic()
-        while self._process.poll() is None:
-            now = self._path.stat().st_size if self._path.exists() else 0
-            if now != size:
+        while self._feeding.is_alive():
+            if (now := self._size()) != size:
                 size, since = now, time.monotonic()
             if time.monotonic() > since + PATIENCE:
                 raise EncodingFailed(f"ffmpeg wrote nothing for {PATIENCE:g} s")
-            with suppress(subprocess.TimeoutExpired):
-                self._process.wait(0.1)
-        if status := self._process.returncode:
-            raise EncodingFailed(self._said() or f"ffmpeg ended with status {status}")
+            self._feeding.join(0.1)
+        if self._problem:
+            raise EncodingFailed(self._problem)
 
     def stop(self) -> None:
-        """Ends ffmpeg and its children, if it has not ended."""
-        if self._process.poll() is None:
-            self._kill()
-            self._process.wait()
-        for pipe in (self._process.stdin, self._process.stderr):
-            assert pipe is not None
-            pipe.close()
+        """Ends ffmpeg and the thread, if they have not ended."""
+        # mediapy has no way to give up.
+        process = getattr(self._writer, "_proc", None)
+        if process is not None and process.poll() is None:
+            process.kill()
+        with suppress(queue.Full):
+            self._frames.put_nowait(None)
 
-    def _said(self) -> str:
-        """Returns the errors that ffmpeg has written, and ends it."""
-        self._kill()
-        assert self._process.stderr is not None
-        return self._process.stderr.read().decode(errors="replace").strip()
+    def _put(self, frame: np.ndarray | None) -> None:
+        """Hands a frame to the thread."""
+        patient_until = time.monotonic() + PATIENCE
+        while time.monotonic() < patient_until:
+            if not self._feeding.is_alive():
+                raise EncodingFailed(self._problem or "ffmpeg has ended")
+            with suppress(queue.Full):
+                return self._frames.put(frame, timeout=0.1)
+        raise EncodingFailed(f"ffmpeg took no frame for {PATIENCE:g} s")
 
-    def _kill(self) -> None:
-        if not hasattr(os, "killpg"):  # on Windows
-            self._process.kill()
-        else:
-            with suppress(ProcessLookupError):
-                os.killpg(self._process.pid, signal.SIGKILL)
+    def _feed(self) -> None:
+        """Writes frames until None comes, or ffmpeg has ended."""
+        try:
+            with self._writer as writer:
+                while (frame := self._frames.get()) is not None:
+                    writer.add_image(frame)
+        except Exception as error:  # whatever the writer raises when ffmpeg fails or is ended
+            self._problem = brief(error)
+
+    def _size(self) -> int:
+        """Returns the size of the file [bytes]."""
+        with suppress(OSError):
+            return int(self._writer.path.stat().st_size)
+        return 0
 
 
 def check_whole(path: Path) -> None:

@@ -52,6 +52,7 @@ LATE = (
     "imageio_ffmpeg",
     "matplotlib.backends.backend_pdf",
     "matplotlib.pyplot",
+    "mediapy",
     "mujoco.batch",
     "pydantic.dataclasses",
     "pydantic.type_adapter",
