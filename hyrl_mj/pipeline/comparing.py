@@ -106,7 +106,7 @@ def compare(
     of_runs = [replace(common, seed=s, out=folder / f"hyrl-{s}") for s in options.seeds]
     for one in of_runs:  # a wrong value is reported before the work
         settings_of(task, one)
-    lasting = task.abilities.arrival_ends
+    lasting = task.tells_arrival
     fresh = Compared(reference(task), options.eps, options.preset, options.set, lasting)
     compared.opened(folder, fresh)
     with locked(folder):
