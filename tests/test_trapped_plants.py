@@ -14,6 +14,7 @@ from hyrl_mj.judging.proof import why_no_cells
 from hyrl_mj.judging.proof.affine import Unbounded
 from hyrl_mj.judging.proof.assumptions import check_assumptions
 from hyrl_mj.sets import Grid
+from hyrl_mj.simulation import noise
 from hyrl_mj.tasks import Outcome, check_task, trial
 from hyrl_mj.tasks.motion import begins_anew, stands_still
 
@@ -224,6 +225,16 @@ def test_what_a_file_remembers_or_draws_is_refused(tmp_path, monkeypatch, room, 
     task = task_of(ends(vehicle(), code), tmp_path, monkeypatch)
     with pytest.raises(BadInput, match=says):
         check_task(task)
+
+
+def test_a_file_that_registers_what_can_be_registered_once_is_taken(tmp_path, monkeypatch):
+    room = "@hyrl_mj.register_noise\nclass Mine(hyrl_mj.Signal):\n    kind = 'of_a_task_file'\n"
+    room += "    def sample(self, now):\n        return 0.0 * now.measurement\n"
+    monkeypatch.setattr(
+        trapped_plants, "TASK", TASK.replace("class Robot", f"{room}\n\nclass Robot")
+    )
+    monkeypatch.setattr(noise, "_KINDS", dict(noise._KINDS))
+    trial.try_methods(task_of(vehicle(), tmp_path, monkeypatch))
 
 
 BEARING = """

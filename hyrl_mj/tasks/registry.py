@@ -280,18 +280,20 @@ def _by_reference(task: Task) -> tuple[Callable[[str], Task], tuple[str], dict[s
 
 
 def made_again(task: Task) -> Task | None:
-    """Returns the task of a file that is executed once more; None of a task that no file made."""
+    """Returns the task of a file that is executed once more; None of a task that no file makes twice."""
     kind = type(task)
     if kind not in _FILES.values():
         return None
     assert kind.source is not None
-    known = dict(_REGISTRY)
+    known, name = dict(_REGISTRY), f"{kind.__module__}_again"
     try:
-        module = _executed(kind.source, f"{kind.__module__}_again")
-        again: type[Task] = getattr(module, kind.__name__)
+        again: type[Task] = getattr(_executed(kind.source, name), kind.__name__)
         again.source = kind.source
-        return _instance(again, kind.name)
+        return again()
+    except Exception:  # such as of what can be registered once
+        return None
     finally:
+        sys.modules.pop(name, None)
         _REGISTRY.clear()
         _REGISTRY.update(known)
 
