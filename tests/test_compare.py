@@ -24,8 +24,9 @@ from hyrl_mj.alternatives.smooth import PairedBuffer, SmoothPolicy
 from hyrl_mj.alternatives.timer import TimerSupervisor, returns
 from hyrl_mj.alternatives.training import environment, learned
 from hyrl_mj.files import artifacts
+from hyrl_mj.judging.game import ReplayCount
 from hyrl_mj.learning.training import export
-from hyrl_mj.pipeline import comparing, steps
+from hyrl_mj.pipeline import comparing, steps, sweeping
 from hyrl_mj.policies import PolicyController, from_callable
 from hyrl_mj.runs.compared import Compared, Row
 from hyrl_mj.sets import Grid
@@ -337,10 +338,14 @@ def test_rows_are_made_tuned_and_judged_alike(result, folder, planted_circle):
     assert "won" not in rows["held"].figures
     assert {*rows["held"].tried} == {f"{k} samples" for k in (2, 3, 5, 8)}
     assert rows["held"].tried[rows["held"].sentence] == max(rows["held"].tried.values())
-    for name in ("policy", "hyrl"):  # by the game, as in the run's own examination
-        score = planted_circle[0].robustness.game.scores[name][-1]
-        assert rows[name].figures["won"] == score.not_broken
-        assert rows[name].figures["proved"] == score.proved
+    # By the game, as in the run's own examination.
+    game = planted_circle[0].robustness.game
+    assert rows["hyrl"].figures["won"] == game.scores["hyrl"][-1].not_broken
+    assert rows["hyrl"].figures["proved"] == game.scores["hyrl"][-1].proved
+    # Nothing is won where a replay has lost what the game calls won.
+    assert game.scores["policy"][-1].not_broken == 1
+    assert game.replays_of("policy").failures
+    assert not {"won", "proved"} & {*rows["policy"].figures}
     assert any(text.startswith("held: ") for text in said)
     assert Compared.load(folder) == found
 
@@ -356,7 +361,27 @@ def test_what_is_done_is_not_done_again(result, folder, monkeypatch):
     assert said == ["seed 0: done before"]
 
 
-@pytest.mark.parametrize("mistake", [Unfit("nothing fits it"), BadInput("nothing fits it")])
+def test_rows_of_other_code_are_made_again(result, circle):
+    found, said = result[0], []
+    assert comparing._without_outdated(found, circle, said.append) == found
+    held = found.row("held", 0)
+    edited = replace(held, code=held.code[:64] + 64 * "0")
+    strange = replace(held, name="not imported here")  # may be what it was
+    changed = found.with_row(edited).with_row(strange)
+    assert comparing._without_outdated(changed, circle, said.append).names == (
+        *(name for name in found.names if name != "held"),
+        "not imported here",
+    )
+    assert said == ["held: left out, because their code or that of the task has changed"]
+    task = copy(circle)
+    vars(task)["code"] = "another"
+    assert comparing._without_outdated(changed, task, len).rows == ()
+
+
+@pytest.mark.parametrize(
+    "mistake",
+    [Unfit("nothing fits it"), BadInput("nothing fits it"), ValueError("nothing fits it"), None],
+)
 def test_a_file_makes_an_alternative_which_may_not_fit(mistake, result, folder, small, monkeypatch):
     monkeypatch.setattr(base, "_KNOWN", dict(base._KNOWN))
 
@@ -365,13 +390,70 @@ def test_a_file_makes_an_alternative_which_may_not_fit(mistake, result, folder, 
         name, title = f"never-{type(mistake).__name__}", "never"
 
         def candidates(self, given):
+            if mistake is None:
+                return
             yield Candidate("first", given.run.controllers["policy"])
             raise mistake
 
-    found = hyrl_mj.compare("unit_circle", out=folder, only=(Never.name,), say=len, **RUNS)
+    says = {ValueError: "it raises ValueError: nothing fits it", type(None): "yields no setting"}
+    said = []
+    for _ in range(2):  # what did not fit may fit now, as where a package was missing
+        found = hyrl_mj.compare(
+            "unit_circle", out=folder, only=(Never.name,), say=said.append, **RUNS
+        )
+    assert sum(text.startswith(Never.name) for text in said) == 2
     row = found.row(Never.name, 0)
-    assert (row.state, row.sentence) == ("unfit", "nothing fits it")
-    assert any("nothing fits it" in sentence for sentence in sentences(found))
+    assert row.state == "unfit"
+    assert says.get(type(mistake), "nothing fits it") in row.sentence
+    assert any(row.sentence in sentence for sentence in sentences(found))
+
+
+def test_a_name_is_that_of_one_alternative():
+    with pytest.raises(BadInput, match=r"'hyrl' is already hyrl_mj\.alternatives\.of_run\.Hyrl"):
+        register(type("Mine", (Alternative,), {"name": "hyrl", "candidates": None}))
+
+
+def test_an_alternative_cannot_change_the_run_of_the_others(planted_circle, monkeypatch):
+    run = planted_circle[0]
+    before = run.policy.layers[0][0].copy()
+
+    class Writes(Alternative):
+        name = title = "writes"
+
+        def candidates(self, given):
+            given.run.policy.layers[0][0][:] = 0
+            raise Unfit("done")
+
+    monkeypatch.setattr(base, "_KNOWN", {**base._KNOWN, "writes": Writes()})
+    assert comparing.judged(run, "writes", seed=0).sentence == "done"
+    np.testing.assert_array_equal(run.policy.layers[0][0], before)
+
+
+@pytest.mark.parametrize("lost", [0, 3])
+def test_what_a_replay_refutes_is_not_won(planted_circle, lost):
+    result = planted_circle[0].robustness
+    replays = ReplayCount("one", 0.1, False, "proved", {"none": 9}, {"none": lost}, 1, None)
+    game = replace(result.game, scores={"one": result.game.scores["hyrl"]}, replays=(replays,))
+    found = comparing._shares(replace(result, game=game, attacks=(), comparisons=()))
+    assert ("won" in found) == ("proved" in found) == (not lost)
+
+
+def test_sensors_that_a_task_declares_are_compared_and_not_swept(circle, tmp_path, monkeypatch):
+    task, asked = copy(circle), []
+    task.sensor = "uniform 0.05 + bias 0.05 + delay 1"
+    for module in (comparing, sweeping):
+        monkeypatch.setattr(module, "usable_task", lambda task: task)
+
+    def made(task, options, say):
+        asked.append(options)
+        raise BadInput("enough")
+
+    monkeypatch.setattr(comparing, "run", made)
+    with pytest.raises(BadInput, match="enough"):
+        hyrl_mj.compare(task, out=tmp_path / "compare")
+    assert comparing.settings_of(task, asked[0]).sensor == task.sensor
+    with pytest.raises(BadInput, match=r"declares what its sensors do .*give --eps"):
+        hyrl_mj.sweep([task], out=tmp_path / "sweep")
 
 
 def test_the_page_shows_the_figure_and_the_table(result, folder):

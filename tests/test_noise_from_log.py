@@ -9,7 +9,7 @@ from command_line import call
 from PIL import Image
 from scipy import signal, stats
 
-from hyrl_mj import BadInput, from_callable, get_task, noise_from_log
+from hyrl_mj import BadInput, Sensor, from_callable, get_task, noise_from_log
 from hyrl_mj.files import logs
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.simulation import LoopSettings, closed_loop, noise_of
@@ -135,6 +135,7 @@ def test_the_worst_of_each_quantity_is_given_for_all(tmp_path):
     assert [c.name for c in noise_from_log(path, columns=["y"]).columns] == ["y"]
     told = call("noise", path, "--columns", "y,x").stdout
     assert "x: uniform 0.02 + delay 2\n" in told
+    assert "is the worst of all columns, whatever their units" in told
     assert 'hyrl-mj run TASK --noise "uniform 0.0499 + bias 0.1 + delay 2"' in told
 
 
@@ -155,6 +156,20 @@ def test_other_units_are_named_and_scaled(of):
     with pytest.raises(BadInput, match=r"as radians against degrees: give --scale x=57[.]29"):
         of(log | {"x_ref": np.degrees(log["x_ref"])})
     assert "0.8 times as much" in " ".join(of(log | {"x": 0.8 * log["x"]}).remarks)
+    late = planted(0, 0.05, uniform=0.02, delay=2)
+    with pytest.raises(BadInput, match="with the other sign: give --scale x=-1"):
+        of(late | {"x": -late["x"]})
+    assert of(late | {"x": -late["x"]}, scale={"x": -1}).delay == 2
+
+
+def test_times_in_milliseconds_are_asked_about_and_not_played(tmp_path):
+    log = planted(0, 0.005, uniform=0.05, seconds=60)
+    log["t"] *= 1000
+    path = write_theta(tmp_path, log)
+    assert "are the times in seconds?" in " ".join(noise_from_log(path).remarks)
+    task = get_task("unit_circle")
+    with pytest.raises(BadInput, match=r"5 s apart and the samples of unit_circle 0\.05 s"):
+        noise_of(task, f"log {path}", 0.0).against(task, None)
 
 
 # ---- what a log does not tell is said
@@ -337,12 +352,14 @@ def test_what_is_held_while_the_reference_moves_is_held_from_the_first_row_on(tm
     assert column.bound == pytest.approx(0.02, rel=0.1)
 
 
-def test_beside_a_quantum_that_is_larger_both_reach_as_far_as_the_errors(tmp_path):
+@pytest.mark.parametrize("quantum", [0.03, 0.06])
+def test_beside_a_quantum_that_is_larger_both_reach_as_far_as_the_errors(tmp_path, quantum):
     log, rng = planted(0, 0.05, uniform=0.0), np.random.default_rng(0)
-    log["x"] = np.round((log["x_ref"] + rng.normal(0, 0.005, len(log["t"]))) / 0.03) * 0.03
+    log["x"] = np.round((log["x_ref"] + rng.normal(0, 0.005, len(log["t"]))) / quantum) * quantum
     (column,) = noise_from_log(write(tmp_path / "log.csv", log)).columns
-    assert column.quantum == pytest.approx(0.03)
-    assert np.mean(np.abs(log["x"] - log["x_ref"]) > column.bound + 0.015) < 0.002
+    assert column.quantum == pytest.approx(quantum)
+    assert np.mean(np.abs(log["x"] - log["x_ref"]) > column.bound + quantum / 2) < 0.002
+    assert Sensor.parse(column.text).bound == pytest.approx(column.bound + quantum / 2, rel=0.01)
 
 
 def test_angles_that_jump_by_a_turn_are_no_noise(tmp_path):

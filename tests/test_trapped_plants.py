@@ -5,7 +5,8 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
-from trapped_plants import TRAPS, Robot, dial, ends, examined, methods, task_of, vehicle
+import trapped_plants
+from trapped_plants import TASK, TRAPS, Robot, dial, ends, examined, methods, task_of, vehicle
 
 from hyrl_mj import BadInput
 from hyrl_mj.judging.game import Lattice
@@ -13,7 +14,8 @@ from hyrl_mj.judging.proof import why_no_cells
 from hyrl_mj.judging.proof.affine import Unbounded
 from hyrl_mj.judging.proof.assumptions import check_assumptions
 from hyrl_mj.sets import Grid
-from hyrl_mj.tasks import check_task, trial
+from hyrl_mj.simulation import noise
+from hyrl_mj.tasks import Outcome, check_task, trial
 from hyrl_mj.tasks.motion import begins_anew, stands_still
 
 # The seeds of robots with every trap once: seed k has the trap number k modulo their number.
@@ -202,9 +204,99 @@ def test_a_method_that_a_proof_takes_for_the_default_must_be_it(tmp_path, monkey
 def test_an_end_with_a_memory_is_refused(tmp_path, monkeypatch, code):
     task = task_of(ends(vehicle(), code), tmp_path, monkeypatch)
     with pytest.raises(
-        BadInput, match=r"gives \d and then \d for the same row|change its attribute count"
+        BadInput, match=r"gives \d and then \d for the same row|methods change count"
     ):
         check_task(task)
+
+
+@pytest.mark.parametrize(
+    ("room", "code", "says"),
+    [
+        ("COUNT = [0]", "COUNT[0] += 1", "methods change COUNT when"),
+        ("RNG = np.random.default_rng()", "RNG.random()", "methods change RNG when"),
+        ("", "ends[np.random.random(len(x)) < 1e-9] = 2", "draw from a global generator"),
+        (
+            "WIDE = np.random.default_rng().uniform(0.3, 0.6)",
+            "ends[(x - 1.5) ** 2 + y**2 <= WIDE] = Outcome.CRASHED",
+            r"ending\(\) gives .* where .*py is executed once more",
+        ),
+    ],
+)
+def test_what_a_file_remembers_or_draws_is_refused(tmp_path, monkeypatch, room, code, says):
+    monkeypatch.setattr(
+        trapped_plants, "TASK", TASK.replace("class Robot", f"{room}\n\nclass Robot")
+    )
+    task = task_of(ends(vehicle(), code), tmp_path, monkeypatch)
+    with pytest.raises(BadInput, match=says):
+        check_task(task)
+
+
+def test_a_file_that_registers_what_can_be_registered_once_is_taken(tmp_path, monkeypatch):
+    room = "@hyrl_mj.register_noise\nclass Mine(hyrl_mj.Signal):\n    kind = 'of_a_task_file'\n"
+    room += "    def sample(self, now):\n        return 0.0 * now.measurement\n"
+    monkeypatch.setattr(
+        trapped_plants, "TASK", TASK.replace("class Robot", f"{room}\n\nclass Robot")
+    )
+    monkeypatch.setattr(noise, "_KINDS", dict(noise._KINDS))
+    trial.try_methods(task_of(vehicle(), tmp_path, monkeypatch))
+
+
+BEARING = """
+    def measure(self, sensors):
+        x, y = sensors.T
+        return np.stack([np.hypot(x + 1, y), np.arctan2(y, x + 1)], axis=1)
+
+    def z(self, measured):
+        r, b = measured.T
+        return np.stack([r * np.cos(b) - 1, r * np.sin(b)], axis=1)
+
+    def with_z(self, measured, z):
+        return self.measure(z)
+"""
+# Robots that are not what they seem, and what is said of each: changes of the MJCF, and of the task's file.
+SEEMING = {
+    "a keyframe with a speed": (
+        vehicle()._replace(kv=100),
+        {"keyframe": '<keyframe><key qvel="0 0.8" ctrl="1 0"/></keyframe>'},
+        {},
+        r"keyframe in trapped_\d+_\d+.xml has velocities",
+    ),
+    "a circle with a stop": (
+        dial()._replace(kv=1e6, on_joint='limited="true" range="-180 180"'),
+        {"flag": ""},
+        {},
+        "periodic, and joint theta has a range",
+    ),
+    "an angle that hides more far away": (
+        methods(ends(vehicle(), "ends = ends"), BEARING),
+        {},
+        {
+            "ending": "x, y = self.z(measured).T\n        ends = np.full(len(x), Outcome.RUNNING)",
+            "noisy": "(True, True)",
+            "box": "(0.0, -0.1), (0.2, 0.1)",
+        },
+        "noise of 1 in the noisy columns moves the chart's x by 2",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", SEEMING)
+def test_what_is_not_as_it_seems_is_refused(tmp_path, monkeypatch, what):
+    robot, xml, py, says = SEEMING[what]
+    robot = robot._replace(xml=robot.xml | xml, py=robot.py | py)
+    with pytest.raises(BadInput, match=says):
+        check_task(task_of(robot, tmp_path, monkeypatch))
+
+
+def test_who_hovers_beside_a_small_goal_has_not_arrived(tmp_path, monkeypatch):
+    end = "x, y = measured.T\n        ends = np.full(len(x), Outcome.RUNNING)\n"
+    end += "        ends[np.hypot(x - 9, y) <= 0.02] = Outcome.REACHED"
+    wide = '("x", "y"), ("m", "m"), (-5.0, -10.0), (15.0, 10.0), (False, False)'
+    robot = vehicle()
+    robot = robot._replace(py=robot.py | {"ending": end, "chart": wide, "goal": "[9.0, 0.0]"})
+    task = task_of(robot, tmp_path, monkeypatch)
+    assert task.tells_arrival
+    assert task.verdict(np.array([[8.9, 0.1]])) == Outcome.STALLED
 
 
 @pytest.mark.parametrize(

@@ -140,7 +140,20 @@ _KNOWN: dict[str, Alternative] = {}
 
 
 def register(kind: type[AnyAlternative]) -> type[AnyAlternative]:
-    """Registers an alternative by its name; a class decorator."""
+    """Registers an alternative by its name; a class decorator.
+
+    Raises:
+        BadInput: another class has that name.
+    """
+    other = type(_KNOWN.get(kind.name))
+    if kind.name in _KNOWN and (other.__module__, other.__qualname__) != (
+        kind.__module__,
+        kind.__qualname__,
+    ):
+        raise BadInput(
+            f"{kind.__name__} cannot be registered: the alternative {kind.name!r} is already "
+            f"{other.__module__}.{other.__qualname__}, so choose another name"
+        )
     _KNOWN[kind.name] = kind()
     return kind
 

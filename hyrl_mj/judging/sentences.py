@@ -21,7 +21,7 @@ def comparison_sentence(task: Task, compared: Comparison) -> str:
     low, high = compared.interval
     lost, late = compared.lost, compared.late
     # Where an episode goes on after the arrival, its end does not tell when that was.
-    of_time = f"; late are {late['policy']:,} and {late['hyrl']:,}" * task.abilities.arrival_ends
+    of_time = f"; late are {late['policy']:,} and {late['hyrl']:,}" * task.tells_arrival
     return (
         f"{how}: of {compared.compared:,} starts that both win without noise the policy loses "
         f"{lost['policy']:,} and HyRL {lost['hyrl']:,} (difference {100 * compared.difference:.1f} points, "

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from dataclasses import dataclass, field, replace
 from functools import partial
+from hashlib import sha256
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hyrl_mj.errors import BadInput, unknown
+from hyrl_mj.errors import BadInput, brief, unknown
 from hyrl_mj.files.manifest import locked
+from hyrl_mj.files.sources import digest_of
 from hyrl_mj.judging import Budget, ExamineOptions, attack, examine
 from hyrl_mj.judging.game import Game, Robustness, curve_grid, percent
 from hyrl_mj.learning import setting_value
@@ -25,7 +29,7 @@ from hyrl_mj.pipeline.runs import (
     usable_task,
 )
 from hyrl_mj.pipeline.steps import subject_of
-from hyrl_mj.policies import Controller, is_memory, memory_at_start
+from hyrl_mj.policies import Controller, as_controller, is_memory, memory_at_start
 from hyrl_mj.runs import compared
 from hyrl_mj.runs.compared import Compared, Row
 from hyrl_mj.runs.directory import Run
@@ -45,7 +49,8 @@ class CompareOptions:
     """The options of a comparison.
 
     Attributes:
-        eps: bound of the measurement noise, in the units of the chart.
+        eps: bound of the measurement noise, in the units of the chart; by default 0.1, or what covers the
+            sensors that the task declares.
         seeds: seeds of the runs, as 0-4: a run of HyRL and one of each alternative for each.
         preset: fast, paper or smoke, as for `hyrl-mj run`.
         set: settings of the runs to change, as for `hyrl-mj run`; by default none.
@@ -54,7 +59,7 @@ class CompareOptions:
         out: the folder of the comparison; by default runs/TASK_compare.
     """
 
-    eps: float = 0.1
+    eps: float | None = None
     seeds: tuple[int, ...] = (0,)
     preset: str = "fast"
     set: dict[str, Any] = field(default_factory=dict)
@@ -104,15 +109,14 @@ def compare(
     folder = Path(options.out or Path("runs") / f"{task.name}_compare")
     common = RunOptions(eps=options.eps, preset=options.preset, set=options.set)
     of_runs = [replace(common, seed=s, out=folder / f"hyrl-{s}") for s in options.seeds]
-    for one in of_runs:  # a wrong value is reported before the work
-        settings_of(task, one)
-    lasting = task.abilities.arrival_ends
-    fresh = Compared(reference(task), options.eps, options.preset, options.set, lasting)
+    # A wrong value is reported before the work.
+    eps = {settings_of(task, one).eps for one in of_runs}.pop()
+    fresh = Compared(reference(task), eps, options.preset, options.set, task.tells_arrival)
     compared.opened(folder, fresh)
     with locked(folder):
-        found = compared.opened(folder, fresh)
+        found = _without_outdated(compared.opened(folder, fresh), task, say)
         for seed, one in zip(options.seeds, of_runs, strict=True):
-            open_ = [n for n in chosen if (r := found.row(n, seed)) is None or r.state == "open"]
+            open_ = [n for n in chosen if (r := found.row(n, seed)) is None or r.state != "done"]
             if not open_:
                 say(f"seed {seed}: done before")
                 continue
@@ -123,6 +127,30 @@ def compare(
                 say(_told(row))
         write_page(found, folder)
     return found
+
+
+def _without_outdated(found: Compared, task: Task, say: Say) -> Compared:
+    """Returns a comparison without the rows that another code has made, of the task or of an alternative."""
+    from hyrl_mj.alternatives import registered
+
+    def is_of_now(row: Row) -> bool:
+        now = _code(task, row.name)
+        return row.code == now or (row.name not in registered() and row.code[:64] == now[:64])
+
+    kept = tuple(filter(is_of_now, found.rows))
+    if gone := sorted({row.name for row in found.rows} - {row.name for row in kept}):
+        say(f"{', '.join(gone)}: left out, because their code or that of the task has changed")
+    return replace(found, rows=kept)
+
+
+def _code(task: Task, name: str) -> str:
+    """Returns digests of the code that makes a row: of the package and the task, and of the alternative."""
+    from hyrl_mj.alternatives import registered
+
+    module = type(registered()[name]).__module__ if name in registered() else ""
+    file = getattr(sys.modules.get(module), "__file__", None)
+    common = sha256(f"{version('hyrl-mj')} {task.code}".encode()).hexdigest()
+    return common + (digest_of(Path(file)) if file else "")
 
 
 def _told(row: Row) -> str:
@@ -136,26 +164,52 @@ def _told(row: Row) -> str:
 
 def judged(made: Run, name: str, *, seed: int) -> Row:
     """Returns the row of an alternative: the best of its settings, judged as HyRL is."""
-    from hyrl_mj.alternatives import Given, registered
+    from hyrl_mj.alternatives import registered
 
-    began, kind = time.monotonic(), registered()[name]
-    row = Row(name, kind.title, seed)
+    kind = registered()[name]
+    row = Row(name, kind.title, seed, code=_code(made.task, name))
     try:
-        candidates = [*kind.candidates(Given(made, seed))]
-        tried: dict[str, float] = {}
-        if len(candidates) > 1:
-            tried = {c.label: _worst(made, c.controller, seed) for c in candidates}
-        best = max(candidates, key=lambda one: tried.get(one.label, 0.0))  # the first of the best
-        seconds = time.monotonic() - began
-        figures = figures_of(made, best.controller, seed)
+        return _made(made, row)
     except BadInput as error:  # the others go on
         return replace(row, state="unfit", sentence=str(error))
-    return Row(name, kind.title, seed, "done", best.label, tried, best.samples, seconds, figures)
+    except Exception as error:  # whatever a user's class raises
+        if type(kind).__module__.startswith("hyrl_mj."):
+            raise
+        return replace(row, state="unfit", sentence=f"it raises {brief(error)}")
+
+
+def _made(made: Run, row: Row) -> Row:
+    """Returns the row of an alternative with its results.
+
+    Raises:
+        BadInput: it does not fit the task.
+    """
+    from hyrl_mj.alternatives import Candidate, Given, registered
+
+    began, seed = time.monotonic(), row.seed
+    # What it does to the policies of the run that it is given changes no other row.
+    candidates = [*registered()[row.name].candidates(Given(made.anew(), seed))]
+    if not candidates or not all(isinstance(each, Candidate) for each in candidates):
+        raise BadInput("candidates() yields no setting: let it yield a Candidate for each")
+    loops = [as_controller(each.controller) for each in candidates]
+    one = len(candidates) == 1
+    scores = [0.0 if one else _worst(made, loop, seed) for loop in loops]
+    number = int(np.argmax(scores))
+    best, seconds = candidates[number], time.monotonic() - began
+    return replace(
+        row,
+        state="done",
+        sentence=best.label,
+        tried={} if one else dict(zip([c.label for c in candidates], scores, strict=True)),
+        samples=best.samples,
+        seconds=seconds,
+        figures=figures_of(made, loops[number], seed),
+    )
 
 
 def _playable(made: Run, controller: Controller) -> bool:
-    """Returns whether the worst-case game can be played against a controller."""
-    return made.why_no_game is None and not is_memory(memory_at_start(controller, 1))
+    """Returns whether the worst-case game can be played against a controller, and is no estimate."""
+    return made.exact and not is_memory(memory_at_start(controller, 1))
 
 
 def _worst(made: Run, controller: Controller, seed: int) -> float:
@@ -203,7 +257,10 @@ def figures_of(made: Run, controller: Controller, seed: int) -> dict[str, float]
 def _shares(result: Robustness) -> dict[str, float]:
     """Returns shares of starts from an examination of one controller."""
     found: dict[str, float] = {}
-    if (game := result.game) is not None:
+    game = result.game
+    # What is lost where it is played in MuJoCo is not won, whatever the game says.
+    replays = game.replays_of("one") if game else None
+    if game is not None and not (replays and replays.failures):
         quiet, last = (game.scores["one"][i] for i in (0, -1))
         found |= {"winnable": last.winnable, "won": last.not_broken, "won_quiet": quiet.not_broken}
         if last.proved is not None:

@@ -15,6 +15,7 @@ from hyrl_mj.learning import setting_value
 from hyrl_mj.pipeline import cluster
 from hyrl_mj.pipeline.board import Board
 from hyrl_mj.pipeline.runs import (
+    BOUND,
     RunOptions,
     checked_seeds,
     complete,
@@ -35,7 +36,8 @@ class SweepOptions:
 
     Attributes:
         seeds: seeds of the runs, as 0-9.
-        eps: bounds of the measurement noise to survive, in the units of the chart, as 0.05,0.1,0.2.
+        eps: bounds of the measurement noise to survive, in the units of the chart, as 0.05,0.1,0.2; by
+            default 0.1.
         algorithm: the algorithms of stage 1, as dqn,ppo; by default the task's.
         preset: fast, paper or smoke, as for `hyrl-mj run`.
         horizon: time T of the backward propagation [s]; by default as for `hyrl-mj run`.
@@ -50,7 +52,7 @@ class SweepOptions:
     """
 
     seeds: tuple[int, ...] = (0,)
-    eps: tuple[float, ...] = (0.1,)
+    eps: tuple[float, ...] | None = None
     algorithm: tuple[str, ...] = ()
     preset: str = "fast"
     horizon: float | None = None
@@ -61,10 +63,15 @@ class SweepOptions:
     address: str | None = None
     out: str | Path = Path("runs/sweep")
 
+    @property
+    def bounds(self) -> tuple[float, ...]:
+        """The bounds of the noise."""
+        return (BOUND,) if self.eps is None else self.eps
+
     def __post_init__(self) -> None:
         values = {
             "seeds": checked_seeds(self.seeds),
-            "eps": tuple(map(check_bound, several(self.eps))),
+            "eps": None if self.eps is None else tuple(map(check_bound, several(self.eps))),
             "algorithm": several(self.algorithm),
             "set": {name: setting_value(value) for name, value in self.set.items()},
         }
@@ -165,7 +172,12 @@ def _jobs(names: tuple[str | Path, ...], options: SweepOptions) -> Iterator[tupl
                 f"the task {task.name} is defined in this session alone, where the processes of a sweep do "
                 "not find it: write it into a Python file, and give that"
             )
-        for algorithm, eps in product(options.algorithm or (None,), options.eps):
+        if task.sensor and options.eps is None:
+            raise BadInput(
+                f"{task.name} declares what its sensors do ({task.sensor}), and a sweep is made for bounds "
+                "alone: give --eps, and the sensors are left out"
+            )
+        for algorithm, eps in product(options.algorithm or (None,), options.bounds):
             one = RunOptions(
                 eps=eps,
                 preset=options.preset,
@@ -189,7 +201,7 @@ def _jobs(names: tuple[str | Path, ...], options: SweepOptions) -> Iterator[tupl
 
 def _check(names: tuple[str | Path, ...], options: SweepOptions) -> None:
     """Raises `BadInput` if there is nothing to do, or a share is out of range."""
-    for what, values in (("task", names), ("seed", options.seeds), ("eps", options.eps)):
+    for what, values in (("task", names), ("seed", options.seeds), ("eps", options.bounds)):
         if not values:
             raise BadInput(f"a sweep needs at least one {what}: give one or more")
     if options.cores is not None:

@@ -29,6 +29,7 @@ class Row:
         samples: of the environment, that its training took.
         seconds: that making and choosing it took [s].
         figures: the results by name.
+        code: a digest of all code that made it; another one makes it anew.
     """
 
     name: str
@@ -40,6 +41,7 @@ class Row:
     samples: int = 0
     seconds: float = 0.0
     figures: dict[str, float] = field(default_factory=dict)
+    code: str = ""
 
 
 @dataclass(frozen=True)
@@ -117,7 +119,7 @@ def opened(folder: Path, fresh: Compared) -> Compared:
                 f"{folder} exists and is not the folder of a comparison: choose another --out"
             )
         return fresh
-    there = Compared.load(folder)
+    there = replace(Compared.load(folder), lasting=fresh.lasting)
     if replace(there, rows=()) != fresh:
         raise BadInput(
             f"{folder} holds a comparison of {there.task} with eps {there.eps:g}, preset {there.preset} and "

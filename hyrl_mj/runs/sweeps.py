@@ -100,7 +100,7 @@ class Row:
             state="done",
             sentence=verdict.sentence,
             verdict=verdict.word,
-            figures=_figures(run.robustness, run.task.abilities.arrival_ends),
+            figures=_figures(run.robustness, run.task.tells_arrival),
         )
 
     def stopped(self, sentence: str) -> Row:

@@ -300,19 +300,28 @@ def _delay(
     """Returns by how many samples y is later than r, by least squares; NaN and why if it cannot be told.
 
     A line is taken out of each tenth of the error, because drift is no delay.
+
+    Raises:
+        BadInput: it follows r with the other sign.
     """
     from scipy import signal, stats
 
+    def left(error: np.ndarray) -> float:
+        """Returns the mean square of an error (n,), NaN where it is not used."""
+        error = error[fresh & np.isfinite(error)]
+        if len(error) < LEAST:
+            return np.inf
+        parts = np.linspace(0, len(error), 11).astype(int)[1:-1]
+        return float(np.mean(signal.detrend(_short(error, turn), bp=parts) ** 2))
+
     most = min(LONGEST_DELAY, len(y) // 8)
     lags = np.arange(-most // 10, most + 1)
-    squares = np.full(len(lags), np.inf)
-    for i, lag in enumerate(lags.tolist()):
-        error = y - _shifted(r, lag)
-        error = error[fresh & np.isfinite(error)]
-        if len(error) >= LEAST:
-            error = _short(error, turn)
-            parts = np.linspace(0, len(error), 11).astype(int)[1:-1]
-            squares[i] = np.mean(signal.detrend(error, bp=parts) ** 2)
+    shifted = [_shifted(r, lag) for lag in lags.tolist()]
+    squares = np.array([left(y - late) for late in shifted])
+    if min(left(-y - late) for late in shifted) < squares.min() / 4:
+        raise BadInput(
+            f"{name} changes as {name}_ref does with the other sign: give --scale {name}=-1"
+        )
     i = int(np.clip(np.argmin(squares), 1, len(lags) - 2))
     beside, best = squares[[i - 1, i + 1]], max(squares[i], 1e-300)
     if not np.isfinite(beside).all():
@@ -479,13 +488,15 @@ def _noise_left(
     bound = float(np.quantile(np.abs(left), share))
     kept = np.clip(left, -bound, bound)
     whole, rounding = float(np.mean(kept**2)), quantum**2 / 12
-    # Less is what smoothing leaves of a drift, or rounding of floats.
-    if bound <= max(tiny, drift / 20) or whole < 1.1 * rounding:
+    beyond = bound - quantum / 2  # a twentieth is what smoothing leaves, or the delay
+    if bound <= max(tiny, drift / 20) or (
+        whole < 1.1 * rounding and beyond <= (quantum + drift) / 20
+    ):
         return 0.0, 0.0, False
-    sigma = float(np.sqrt(whole - rounding))
+    sigma = float(np.sqrt(max(whole - rounding, (max(beyond, 0.0) / 3) ** 2 * bool(quantum))))
     uniform = not stats.kurtosis(kept) > -0.6  # that of uniform noise is -1.2, of normal noise 0
     if sigma**2 < rounding:  # beside so much rounding only how far both reach together can be told
-        return sigma, max(bound - quantum / 2, 0.0), uniform
+        return sigma, max(beyond, 0.0), uniform
     if not uniform:
         return sigma, bound * sigma / whole**0.5, False
     # Smoothing and rounding blur the edges of uniform noise, but not its deviation.

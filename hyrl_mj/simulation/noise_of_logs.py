@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 TIMES = ("t", "time")
 COLUMNS = 500  # that are looked at, each of which takes some 10 ms
+SLOW = 0.5  # [s]: few robots are controlled so slowly
+LONGEST = 10  # samples of a robot, for which a row of a log may last
 MOST = 20_000_000  # samples with gaps between them, which take 160 MB a column and step
 
 
@@ -118,6 +120,11 @@ class _Windows(Signal):
         steps = np.diff(times)
         steps = np.minimum(steps, 2 * np.quantile(steps, 0.95))
         self._times = np.concatenate([[0.0], np.cumsum(steps)])
+        if (step := float(np.median(steps))) > LONGEST * task.dt:
+            raise BadInput(
+                f"the rows of the log are {step:g} s apart and the samples of {task.name} {task.dt:g} s, so "
+                "that each error would stay for long: give the times in seconds, or a log with more rows"
+            )
 
     def reset(self, n: int, rng: np.random.Generator) -> None:
         super().reset(n, rng)
@@ -184,7 +191,7 @@ def noise_from_log(
         raise BadInput(
             f"{path} has so many gaps in time that it takes {place[-1]:,} samples: give at most {MOST:,}"
         )
-    if step > 5:  # [s]: no robot is controlled so slowly
+    if step >= SLOW:
         remarks.append(f"its rows are {step:g} s apart: are the times in seconds?")
     if rows * (1 - share) < 1 and share < 1:
         remarks.append(
@@ -209,6 +216,11 @@ def noise_from_log(
         remarks.append(
             f"delay and held samples are counted in samples of this log, of {step:.3g} s: for a robot with "
             "another sample time, give the samples of the robot that take as long, rounded up"
+        )
+    if len({column.text for column in found}) > 1:
+        remarks.append(
+            "the noise to give to a run is the worst of all columns, whatever their units; a task gives each "
+            "of its columns the share in its `noisy` of that, so a share below 1 needs so much larger bounds"
         )
     if not any(len(column.errors) for column in found):
         raise BadInput(f"{path} tells no noise: {found[0].remarks[0]}")

@@ -272,6 +272,13 @@ class Task(ABC):
         """Whether `ending` calls some states REACHED, on the chart or beside it."""
         return ends_well(self)
 
+    @property
+    def tells_arrival(self) -> bool:
+        """Whether an episode ends where it arrives, so that how long it lasts tells when that was."""
+        return self.abilities.arrival_ends and (
+            type(self).plant is not Task.plant or self.ends_well
+        )
+
     @cached_property
     def set_point(self) -> np.ndarray | None:
         """The goal, a chart point (d,), if it is a single one."""

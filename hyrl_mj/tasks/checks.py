@@ -39,7 +39,8 @@ COMPUTED = (
     "dt", "measurement_columns", "has_inner_loop", "gives_direction", "kinematic", "chart_is_state",
     "obstacles", "plant", "placed", "tabulating", "verify", "draw_inputs", "check_measurement", "check_noise",
     "at", "perturbed", "outcome", "failed", "goes_on", "noise_in_chart", "noise_on", "noisy_everywhere",
-    "with_noise", "with_sensor", "sensor_shares", "moves", "ends_well", "input_levels", "code", "spec",
+    "with_noise", "with_sensor", "sensor_shares", "moves", "ends_well", "tells_arrival", "input_levels",
+    "code", "spec",
 )  # fmt: skip
 
 
@@ -206,6 +207,12 @@ def _check_starts(task: Task) -> None:
         raise BadInput(f"it starts outside its chart, at {point}: change one of them")
     _check_box(task)
     plant = task.placed(z, np.random.default_rng(1))
+    moves = task.model.nkey and task.model.key_qvel[0].any()
+    if type(task).plant is Task.plant and moves and task.state(z)[1] is None:
+        raise BadInput(
+            f"the first keyframe in {task.model_path.name} has velocities (qvel), and its episodes begin at "
+            "rest: let state() give them, or leave them out"
+        )
     if task.model.nmocap:
         _check_mocap(task, plant.qpos)
     measurement = plant.measurement
@@ -220,7 +227,9 @@ def _check_starts(task: Task) -> None:
     _check_noise_of_chart(task, measurement)
     if task.effort.everywhere:
         anywhere = task.chart.draw(task.effort.starts, np.random.default_rng(3))
-        _check_round_trip(task, anywhere, task.z(task.placed(anywhere).measurement))
+        everywhere = task.placed(anywhere).measurement
+        _check_round_trip(task, anywhere, task.z(everywhere))
+        _check_noise_of_chart(task, everywhere)
     if type(task).plant is Task.plant:
         _check_turns(task, np.vstack([z, task.chart.draw(STARTS, np.random.default_rng(4))]))
     ending = task.ending(measurement)
@@ -259,8 +268,17 @@ def _check_turns(task: Task, z: np.ndarray) -> None:
             poses.append(np.append(data.xpos, data.xmat))
         return np.column_stack([poses, task.ending(plant.measurement)])
 
+    without = mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_LIMIT
+    limited = model.jnt_limited.astype(bool) & (not model.opt.disableflags & without)
     for axis in np.flatnonzero(chart.periodic):
         turn = chart.sides * (np.arange(chart.dimension) == axis)
+        turned = np.abs(task.placed(z + turn).qpos - task.placed(z).qpos).max(axis=0) > 1e-6
+        if (stopped := np.flatnonzero(limited & turned[model.jnt_qposadr])).size:
+            joint = mjcf.names(model, mujoco.mjtObj.mjOBJ_JOINT)[stopped[0]]
+            raise BadInput(
+                f"its chart says that {chart.names[axis]} is periodic, and joint {joint} has a range, which "
+                "stops it: leave the range out, or say that it is not periodic"
+            )
         off = np.abs(seen(z + turn) - seen(z)).max(axis=1)
         if off.max() > 1e-3:  # 3.1416 will do
             raise BadInput(

@@ -279,12 +279,35 @@ def _by_reference(task: Task) -> tuple[Callable[[str], Task], tuple[str], dict[s
     )
 
 
+def made_again(task: Task) -> Task | None:
+    """Returns the task of a file that is executed once more; None of a task that no file makes twice."""
+    kind = type(task)
+    if kind not in _FILES.values():
+        return None
+    assert kind.source is not None
+    known, name = dict(_REGISTRY), f"{kind.__module__}_again"
+    try:
+        again: type[Task] = getattr(_executed(kind.source, name), kind.__name__)
+        again.source = kind.source
+        return again()
+    except Exception:  # such as of what can be registered once
+        return None
+    finally:
+        sys.modules.pop(name, None)
+        _REGISTRY.clear()
+        _REGISTRY.update(known)
+
+
 def _run(path: Path) -> ModuleType:
     """Imports a file as a module of its own, which can import from its folder as a script can."""
-    name = f"hyrl_mj_task_{path.stem}_{len(_FILES)}"
     check_helpers(path)
     if any(known == path for known, _ in _FILES):  # something has changed
         forget_helpers(path)
+    return _executed(path, f"hyrl_mj_task_{path.stem}_{len(_FILES)}")
+
+
+def _executed(path: Path, name: str) -> ModuleType:
+    """Returns a file as a module of that name."""
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None
     assert spec.loader is not None

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+import pickle
+import random
+import sys
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import cached_property
 from itertools import product
 from typing import Any
@@ -14,14 +18,16 @@ import numpy as np
 from hyrl_mj.errors import BadInput
 from hyrl_mj.physics import mjcf, mujoco_log
 from hyrl_mj.sets import Grid
+from hyrl_mj.system.generators import global_state
 from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.description import Outcome
 from hyrl_mj.tasks.guard import check_finite
-from hyrl_mj.tasks.registry import alike
+from hyrl_mj.tasks.registry import alike, made_again
 
 # Steps of the physics that the episodes of a trial take together, at most; and the fewest side by side.
 STEPS, FEWEST = 200_000, 16
 STARTS = 32  # as training draws them
+ANYWHERE = 4_000  # places at which a task that is made again has to be the same
 # Samples after which an input must have changed something.
 EFFECT = 10
 # Number of the sample -> inputs (n, m).
@@ -68,34 +74,95 @@ def try_methods(task: Task) -> None:
     """Raises `BadInput` if a method gives something else for the same rows in another batch or order.
 
     Then it depends on other rows, or on what it was asked before: nothing that is computed in bulk would
-    hold. Nor may it change an attribute of the task.
+    hold. Nor may it change a variable, draw random numbers, or differ where its file is executed once more.
     """
-    rng, before = np.random.default_rng(0), _attributes(task)
+    rng, own = np.random.default_rng(0), _copied(vars(task))
     z = np.vstack([task.starts(STARTS, rng), task.chart.draw(STARTS, rng)])
     measured, order = task.placed(z).measurement, rng.permutation(len(z))
-    for name, asked in _methods(task, z, measured).items():
-        first = asked(every := np.arange(len(z)))
+    methods, chance = _methods(task, z, measured), global_state()
+    every = np.arange(len(z))
+    for name, asked in methods.items():
+        first = asked(every)
         shuffled = np.empty_like(first)
         shuffled[order] = asked(order)
         alone = first.copy()
         for row in order[:STARTS]:
             alone[row] = asked(np.array([row]))[0]
         for again in (shuffled, asked(every), alone):
-            same = np.isclose(again, first, rtol=1e-9, atol=1e-9, equal_nan=True)
-            if not same.all():
-                row = int(np.argwhere(~same)[0][0])
+            if (row := _differing_row(again, first)) is not None:
                 raise BadInput(
                     f"{name}() gives {again[row]} and then {first[row]} for the same row, at "
                     f"{task.chart.format(z[row])}: let it depend on this row alone, and on nothing before"
                 )
-    after = _attributes(task)
+    _check_unchanged(task, own, vars(task))
+    # What a class or a module fills once, as a cache, has been filled now.
+    shared = _copied(_shared(task))
+    for asked in methods.values():
+        asked(every)
+    _check_unchanged(task, shared, _shared(task))
+    if global_state() != chance:
+        raise BadInput(
+            "its methods draw from a global generator of random numbers: compute from the measurement alone"
+        )
+    _try_again(task)
+
+
+def _try_again(task: Task) -> None:
+    """Raises `BadInput` if a method differs where the file of a task is executed once more."""
+    if (twin := made_again(task)) is None:
+        return
+    z = task.chart.draw(ANYWHERE, np.random.default_rng(0))
+    measured, every = task.placed(z).measurement, np.arange(len(z))
+    asked = _methods(twin, z, measured)
+    for name, of_rows in _methods(task, z, measured).items():
+        here, there = of_rows(every), asked[name](every)
+        if (row := _differing_row(here, there)) is not None:
+            raise BadInput(
+                f"{name}() gives {here[row]} at {task.chart.format(z[row])}, and {there[row]} where "
+                f"{task.source} is executed once more, as each process does: draw nothing there at random, "
+                "and let nothing depend on when it is executed"
+            )
+
+
+def _differing_row(a: np.ndarray, b: np.ndarray) -> int | None:
+    """Returns the first row in which arrays (n, ...) differ by more than rounding; None if there is none."""
+    same = np.isclose(a, b, rtol=1e-9, atol=1e-9, equal_nan=True)
+    return None if same.all() else int(np.argwhere(~same)[0][0])
+
+
+def _check_unchanged(task: Task, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Raises `BadInput` if variables have changed since they were copied, but what is computed once."""
+    after = _copied(now)
     lazy = {name for name in after if isinstance(getattr(type(task), name, None), cached_property)}
     for name in after.keys() - lazy:
         if name not in before or not alike(before[name], after[name]):
             raise BadInput(
-                f"its methods change its attribute {name} when they are asked: a task remembers nothing, so "
-                "compute it from the measurement"
+                f"its methods change {name} when they are asked: a task remembers nothing, so compute it "
+                "from the measurement"
             )
+
+
+def _shared(task: Task) -> dict[str, Any]:
+    """Returns the variables of a task's class, and of the file that defines it, by name."""
+    kinds = [kind for kind in type(task).__mro__ if not kind.__module__.startswith("hyrl_mj.")]
+    # A session of its user's may hold anything.
+    names = {kind.__module__ for kind in kinds} - {"__main__", "builtins", "abc"}
+    rooms = [*(sys.modules[name] for name in names if name in sys.modules), *kinds]
+    return {n: v for room in rooms for n, v in vars(room).items() if not n.startswith("__")}
+
+
+def _copied(variables: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns copies of plain variables by name, of generators of random numbers what tells their state."""
+    kinds = (bool, int, float, str, list, dict, set, np.ndarray, np.generic)
+    chance = (np.random.Generator, np.random.RandomState, random.Random)
+    found: dict[str, Any] = {}
+    for name, value in variables.items():
+        with suppress(Exception):  # what cannot be copied cannot be compared
+            if isinstance(value, kinds):
+                found[name] = copy.deepcopy(value)
+            elif isinstance(value, chance):
+                found[name] = pickle.dumps(value)
+    return found
 
 
 def _methods(task: Task, z: np.ndarray, measured: np.ndarray) -> dict[str, OfRows]:
@@ -107,22 +174,21 @@ def _methods(task: Task, z: np.ndarray, measured: np.ndarray) -> dict[str, OfRow
     def state(rows: np.ndarray) -> np.ndarray:
         return np.hstack([part for part in task.state(z[rows]) if part is not None])
 
+    middle = np.mean(task.input_limits, axis=0)
+
+    def reward(rows: np.ndarray) -> np.ndarray:
+        return task.reward(measured[rows], np.tile(middle, (len(rows), 1)))
+
     names = ["z", "observation", "ending", "verdict"]
     if type(task).plant is not Task.plant:  # an environment answers the rest by itself
         return {name: of_measured(name) for name in names}
     path = np.linspace(z, np.random.default_rng(0).permutation(z), 5)
     names += ["danger"] if task.gives_direction else ["danger", "where"]
     found = {name: of_measured(name) for name in names}
-    found |= {"state": state, "miss": lambda rows: task.miss(z[rows])}
+    found |= {"state": state, "reward": reward, "miss": lambda rows: task.miss(z[rows])}
     if task.gives_direction:
         found["direction"] = lambda rows: task.direction(path[:, rows])
     return found
-
-
-def _attributes(task: Task) -> dict[str, Any]:
-    """Returns copies of a task's plain attributes by name."""
-    kinds = (bool, int, float, str, list, dict, set, np.ndarray, np.generic, np.random.Generator)
-    return {n: copy.deepcopy(v) for n, v in vars(task).items() if isinstance(v, kinds)}
 
 
 def try_inputs(task: Task) -> None:

@@ -351,8 +351,8 @@ def comparison_table(task: Task, comparisons: Sequence[Comparison]) -> Table:
             "starts compared": f"{c.compared:,} of {c.starts:,}",
             "lost under noise": _both(c.lost),
             "difference, 95% [points]": f"{100 * c.difference:.1f} ({low} to {high})",
-            "late": _both(c.late) if task.abilities.arrival_ends else "-",
-            "time, median and 99%": _both(c.time) if task.abilities.arrival_ends else "-",
+            "late": _both(c.late) if task.tells_arrival else "-",
+            "time, median and 99%": _both(c.time) if task.tells_arrival else "-",
             "way, median and 99%": _both(c.way),
         }
         rows.append(row)
