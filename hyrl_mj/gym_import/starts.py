@@ -13,6 +13,7 @@ from functools import partial
 from itertools import chain
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from hyrl_mj.errors import BadInput
@@ -53,10 +54,27 @@ def check_noted(spec: EnvironmentSpec, resets: Resets) -> None:
     _check_following(spec, resets)
     _check_led(spec)
     _check_natural(spec, resets)
+    _check_begun(spec)
 
 
 def _starts(spec: EnvironmentSpec, rng: np.random.Generator) -> np.ndarray:
     return spec.state_at(spec.anywhere(rng, EPISODES))
+
+
+def _check_begun(spec: EnvironmentSpec) -> None:
+    """Raises `BadInput` if a first sample leads to one place, wherever on the chart a run begins."""
+    rng, instance, ends = np.random.default_rng(11), Instance(spec), list[np.ndarray]()
+    starts, inputs, none = _starts(spec, rng), [instance.drawn(rng)], np.zeros((2, spec.dimension))
+    for state in starts:
+        instance = renewed(instance)
+        *_, last = instance.play(state, inputs, none)
+        ends.append(last.state)
+    apart, stays = (np.ptp(spec.z(np.array(states)), axis=0) > 0 for states in (starts, ends))
+    for c in np.array(spec.coordinates, dtype=object)[apart & ~stays]:
+        raise BadInput(
+            f"step() of {spec.name} leads to one {c.name}, wherever on the chart a run begins: it goes by "
+            "something else than MuJoCo's state in its attribute data, as by a second one; let it step that"
+        )
 
 
 def _check_ties(spec: EnvironmentSpec, resets: Resets) -> None:
@@ -253,7 +271,8 @@ def _setpoints(instance: Instance, state: np.ndarray, now: np.ndarray) -> np.nda
         lengths.append(data.actuator_length.copy())
     moved = now.copy()
     gain, bias = model.actuator_gainprm[:, 0], model.actuator_biasprm[:, 1]
-    for i in np.flatnonzero((model.actuator_biastype != 0) & (gain != 0) & (bias != 0)):
+    affine = model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE
+    for i in np.flatnonzero(affine & (gain != 0) & (bias != 0)):
         kind, at = "ctrl", model.actuator_ctrladr[i]
         if model.actuator_dyntype[i] and model.actuator_actadr[i] >= 0:
             kind, at = "act", model.actuator_actadr[i]
@@ -279,21 +298,27 @@ def _check_led(spec: EnvironmentSpec) -> None:
     """Raises `BadInput` if runs depend on what a reset computes of the place in MuJoCo that it leads to."""
     rng, usual, led = np.random.default_rng(11), Instance(spec), Instance(spec)
     none = np.zeros((spec.max_steps, spec.dimension))
+    own = np.append(own_of(usual), usual.physics.columns["warmstart"])
     for state in _starts(spec, rng):
         inputs = [usual.drawn(rng)] * spec.max_steps
         usual, led = map(renewed, (usual, led))
         usual.put(state)
-        led.follow = _Leading(led, state)
+        led.follow, led.own = _Leading(led, state), own  # all else in MuJoCo as the reset leaves it
         try:
-            led.put(state)
+            led.put(state, spec.description.seed or 0)
         except BadInput:  # it cannot begin there
             continue
+        finally:
+            led.own = None
         noted = differing(led.memory(), usual.memory())
+        states = led.physics.read(), usual.physics.read()
+        moved = ~np.isclose(*states, rtol=SAME, atol=SAME)
+        noted += [usual.physics.names[at] for at in np.flatnonzero(moved)]
         if not noted:
             return
         if usual.physics.depth(spec.solid) <= spec.depth:
             ours, theirs = (one.goes_on(inputs, none) for one in (usual, led))
-            _check_alike(spec, ours, theirs, noted[:1], since=1)
+            _check_alike(spec, ours, theirs, noted[:1], since=1, rounding=SAME)
 
 
 class _Leading:
@@ -396,7 +421,9 @@ def _resets_moved(instance: Instance, name: str, by: np.ndarray) -> bool:
 
     Afterwards these are back.
     """
-    owner, key, at = _homes(instance)[name]
+    if (home := _homes(instance).get(name)) is None:  # a reset holds it otherwise than a constructor
+        return False
+    owner, key, at = home
     old = _value(owner, key)
     numbers = np.array(numbers_of(old), dtype=float)
     numbers[at] += np.resize(by, len(at))
