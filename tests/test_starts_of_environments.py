@@ -268,7 +268,7 @@ class Beacon(At):
 
     def reset(self, **options):
         super().reset(**options)
-        self.data.mocap_pos[0, :2] = self.data.qpos + [0.6, 0.1]
+        self.data.mocap_pos[0, :2] = self.data.qpos + np.array([0.6, 0.1])
         mujoco.mj_forward(self.model, self.data)
         return self._get_obs(), {}
 

@@ -537,9 +537,11 @@ def test_what_is_computed_once_for_each_time_is_refused():
 
 def test_one_environment_in_place_of_what_makes_it_is_refused():
     env = Puck()
-    with pytest.raises(BadInput, match="this Puck is one environment, .* a function that makes it"):
+    with pytest.raises(
+        BadInput, match=r"this Puck is one environment, .* a function that makes it"
+    ):
         from_gymnasium(env)
-    with pytest.raises(BadInput, match="gives the same environment each time, .* make a new one"):
+    with pytest.raises(BadInput, match=r"gives the same environment each time, .* make a new one"):
         from_gymnasium(lambda: env)
 
 

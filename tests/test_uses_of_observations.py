@@ -1,5 +1,6 @@
 """What steps, resets and wrappers do with observations and places that noise or a start does not reach."""
 
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import gymnasium as gym
@@ -30,6 +31,20 @@ class Noting(Home):
         return observation, *rest, info | {"bodies": [{"name": "puck", "at": observation[:2]}]}
 
 
+@dataclass(slots=True)
+class Pose:
+    """Has slots in place of a dictionary."""
+
+    place: np.ndarray
+
+
+class Slotted(Noting):
+    """Keeps its place in such an object."""
+
+    def begin(self):
+        self.robot = Pose(self.data.qpos.copy())
+
+
 class ByObject(gym.ObservationWrapper):
     def observation(self, observation):
         return np.append(self.unwrapped.robot.place, observation[2:])
@@ -42,13 +57,18 @@ class ByList(gym.Wrapper):
 
 
 @pytest.mark.parametrize(
-    ("wrapper", "way"), [(ByObject, r"attribute robot\.place"), (ByList, r"info bodies\.0\.at")]
+    ("wrapper", "env", "way"),
+    [
+        (ByObject, Noting, r"attribute robot\.place"),
+        (ByObject, Slotted, r"attribute robot\.place"),
+        (ByList, Noting, r"info bodies\.0\.at"),
+    ],
 )
-def test_wrappers_that_observe_what_objects_hold_are_refused(wrapper, way):
+def test_wrappers_that_observe_what_objects_hold_are_refused(wrapper, env, way):
     with pytest.raises(
         BadInput, match=rf"a wrapper of .* observes .*{way}.*, which follows the place"
     ):
-        from_gymnasium(lambda: wrapper(Noting()))
+        from_gymnasium(lambda: wrapper(env()))
 
 
 class Servo(Flat):

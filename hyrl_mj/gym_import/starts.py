@@ -17,7 +17,15 @@ import mujoco
 import numpy as np
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.gym_import.attributes import held, like, numbers_in, numbers_of, set_numbers
+from hyrl_mj.gym_import.attributes import (
+    held,
+    like,
+    numbers_in,
+    numbers_of,
+    put_at,
+    set_numbers,
+    value_at,
+)
 from hyrl_mj.gym_import.coordinates import own_of
 from hyrl_mj.gym_import.fingerprint import differing, shared_variables
 from hyrl_mj.gym_import.instance import Instance, Seen, renewed, to_end
@@ -405,15 +413,11 @@ def _homes(instance: Instance) -> dict[str, tuple[Any, Any, list[int]]]:
     at, nq = [c.index for c in instance.spec.coordinates if c.kind == "qpos"], instance.model.nq
     found = dict[str, tuple[Any, Any, list[int]]]()
     for name, owner, key in (*held(instance.inner, {}), *shared_variables(instance.env)):
-        numbers = numbers_of(_value(owner, key))
+        numbers = numbers_of(value_at(owner, key))
         if numbers is not None and len(at) <= len(numbers) <= nq:
             found[name] = owner, key, at if len(numbers) == nq else [*range(len(at))]
     keys = [nq * row + i for row in range(instance.model.nkey) for i in at]
     return {**found, "key_qpos": (instance.model, "key_qpos", keys)} if keys else found
-
-
-def _value(owner: Any, key: Any) -> Any:
-    return owner[key] if isinstance(owner, dict | list) else getattr(owner, key)
 
 
 def _resets_moved(instance: Instance, name: str, by: np.ndarray) -> bool:
@@ -421,10 +425,12 @@ def _resets_moved(instance: Instance, name: str, by: np.ndarray) -> bool:
 
     Afterwards these are back.
     """
-    if (home := _homes(instance).get(name)) is None:  # a reset holds it otherwise than a constructor
+    if (
+        home := _homes(instance).get(name)
+    ) is None:  # a reset holds it otherwise than a constructor
         return False
     owner, key, at = home
-    old = _value(owner, key)
+    old = value_at(owner, key)
     numbers = np.array(numbers_of(old), dtype=float)
     numbers[at] += np.resize(by, len(at))
     in_place = isinstance(old, np.ndarray) and old.dtype.kind == "f" and old.flags.writeable
@@ -432,7 +438,7 @@ def _resets_moved(instance: Instance, name: str, by: np.ndarray) -> bool:
     if in_place:
         old[...] = numbers.reshape(old.shape)  # it may be known by several names
     else:
-        _put(owner, key, like(old, numbers.tolist()))
+        put_at(owner, key, like(old, numbers.tolist()))
     instance.follow = _Leading(instance, None)
     try:
         instance.reset()
@@ -443,12 +449,5 @@ def _resets_moved(instance: Instance, name: str, by: np.ndarray) -> bool:
         if in_place:
             old[...] = kept
         else:
-            _put(owner, key, old)
+            put_at(owner, key, old)
     return True
-
-
-def _put(owner: Any, key: Any, value: Any) -> None:
-    if isinstance(owner, dict | list):
-        owner[key] = value
-    else:
-        setattr(owner, key, value)

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.gym_import.attributes import held, numbers_of
+from hyrl_mj.gym_import.attributes import held, numbers_of, put_at, value_at
 from hyrl_mj.gym_import.coordinates import own_of
 from hyrl_mj.gym_import.instance import Instance, Seen, renewed, to_end
 from hyrl_mj.gym_import.observations import flat
@@ -132,9 +132,6 @@ def check_use(spec: EnvironmentSpec) -> None:
                 break
 
 
-# ---- wrappers
-
-
 def check_copied(spec: EnvironmentSpec) -> None:
     """Raises `BadInput` if what is observed shows the place by what code copies into MuJoCo's state.
 
@@ -170,11 +167,11 @@ def check_copied(spec: EnvironmentSpec) -> None:
         one.tamper = None
         seen = [one.seen_as("now", state, none[0]) for state in (here, other)]
         pairs = seen, (shown.observation, runs[0][-1].observation)
-        if not all(np.array_equal(*pair, equal_nan=True) for pair in pairs):
+        if not all(np.array_equal(a, b, equal_nan=True) for a, b in pairs):
+            names = ", ".join(one.physics.names[at] for at in copies[:4])
             raise BadInput(
-                f"what {spec.name} observes shows {', '.join(one.physics.names[at] for at in copies[:4])}, to "
-                "which code copies the place of the robot, where noise does not reach it: let it observe the "
-                "place itself"
+                f"what {spec.name} observes shows {names}, to which code copies the place of the robot, where "
+                "noise does not reach it: let it observe the place itself"
             )
 
 
@@ -185,6 +182,9 @@ def _write(
     if np.array_equal(instance.physics.read(), usual, equal_nan=True):
         instance.physics.write(other)
     return rest
+
+
+# ---- wrappers
 
 
 def check_told(spec: EnvironmentSpec) -> None:
@@ -308,10 +308,10 @@ def _run(
         new = changes[len(told)] if len(told) < len(changes) else {}
         *ends, info = *rest[:-1], dict(rest[-1])  # nothing but the info of a reset
         places = [*held(instance.inner, info)]
-        told.append({name: copy.deepcopy(owner[key]) for name, owner, key in places})
+        told.append({name: copy.deepcopy(value_at(owner, key)) for name, owner, key in places})
         for name, owner, key in places:
             if name in new:
-                owner[key] = copy.deepcopy(new[name])
+                put_at(owner, key, copy.deepcopy(new[name]))
         if ends:
             told[-1][REWARD] = ends[0]
             ends[0] = new.get(REWARD, ends[0])
