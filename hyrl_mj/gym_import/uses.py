@@ -170,8 +170,8 @@ def check_copied(spec: EnvironmentSpec) -> None:
         if not all(np.array_equal(a, b, equal_nan=True) for a, b in pairs):
             names = ", ".join(one.physics.names[at] for at in copies[:4])
             raise BadInput(
-                f"what {spec.name} observes shows {names}, to which code copies the place of the robot, where "
-                "noise does not reach it: let it observe the place itself"
+                f"what {spec.name} observes shows {names}, to which code copies the place of the robot, "
+                "where noise does not reach it: let it observe the place itself"
             )
 
 
