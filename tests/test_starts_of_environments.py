@@ -287,7 +287,7 @@ class Twin(At):
 
     def reset(self, **options):
         mujoco.mj_resetData(self.model, self.plant)
-        self.plant.qpos[:] = PLACE
+        self.plant.qpos[:] = -1.3, 0.5
         return super().reset(**options)
 
     def step(self, action):
