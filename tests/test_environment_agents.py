@@ -218,3 +218,25 @@ def test_parts_of_other_sizes_are_refused_though_their_sum_fits(puck, tmp_path):
         BadArtifact, match=r"Dict\(position \(1,\), to_goal \(2,\), velocity \(3,\)\)"
     ):
         load_agent(tmp_path / "agent.zip", puck)
+
+
+class OnAMap(Puck):
+    """Observes its place on a map, in float64, of which single precision rounds a quarter of a metre."""
+
+    observation_space = spaces.Box(-np.inf, np.inf, (4,), dtype=np.float64)
+
+    def _get_obs(self):
+        return np.concatenate([5e6 + self.data.qpos, self.data.qvel])
+
+
+def test_normalised_numbers_of_float64_are_not_rounded_before(tmp_path):
+    env = VecNormalize(DummyVecEnv([OnAMap]), norm_reward=False)
+    model = SAC("MlpPolicy", env, seed=0, device="cpu", policy_kwargs={"net_arch": [16]})
+    env.obs_rms.mean[:2], env.training = 5e6, False
+    model.save(tmp_path / "agent.zip")
+    env.save(tmp_path / "statistics.pkl")
+    task = hyrl_mj.from_gymnasium(OnAMap, steps=STEPS)
+    agent = load_agent(tmp_path / "agent.zip", task, vecnormalize=tmp_path / "statistics.pkl")
+    (seen,) = env.unwrapped.envs[0]._get_obs()[None] + [0.123, 0.234, 0.5, 0.1]
+    expected, _ = model.predict(env.normalize_obs(seen[None]), deterministic=True)
+    np.testing.assert_allclose(agent.inputs(seen[None]), expected, atol=1e-5)

@@ -257,6 +257,73 @@ class Ahead(Home):
         return float(np.linalg.norm(self.data.qpos[:2] - self.goal)) > 3.0
 
 
+class Beacon(At):
+    """Its goal is a mocap body ahead of where the robot begins; nothing else holds that."""
+
+    draws = False
+    xml = XML.replace(
+        "<worldbody>",
+        '<worldbody><body name="beacon" mocap="true"><site name="end" pos="0 0 1"/></body>',
+    )
+
+    def reset(self, **options):
+        super().reset(**options)
+        self.data.mocap_pos[0, :2] = self.data.qpos + np.array([0.6, 0.1])
+        mujoco.mj_forward(self.model, self.data)
+        return self._get_obs(), {}
+
+    def crashed(self):
+        return float(np.linalg.norm(self.data.qpos - self.data.mocap_pos[0, :2])) > 3.0
+
+
+class Twin(At):
+    """It steps a state of its own, and shows that in `data`."""
+
+    draws = False
+
+    def __init__(self):
+        super().__init__()
+        self.plant = mujoco.MjData(self.model)
+
+    def reset(self, **options):
+        mujoco.mj_resetData(self.model, self.plant)
+        self.plant.qpos[:] = -1.3, 0.5
+        return super().reset(**options)
+
+    def step(self, action):
+        self.plant.ctrl[:] = action
+        mujoco.mj_step(self.model, self.plant, nstep=5)
+        for part in ("qpos", "qvel"):
+            getattr(self.data, part)[:] = getattr(self.plant, part)
+        self.data.time = self.plant.time
+        mujoco.mj_forward(self.model, self.data)
+        off = float(np.linalg.norm(self.data.qpos - GOAL))
+        return self._get_obs(), -off, False, False, {"success": off < 0.25}
+
+
+class Muscles(At):
+    """Muscles pull at it, whose activations all resets set alike."""
+
+    draws = False
+    xml = XML.replace(
+        MOTORS, "".join(f'<muscle joint="{axis}" lengthrange="-3 3" force="9"/>' for axis in "xy")
+    )
+
+    def begin(self, place):
+        self.data.act[:] = 0.1
+
+
+class Renamed(Home):
+    """Its resets hold otherwise what its constructor has made."""
+
+    def __init__(self):
+        super().__init__()
+        self.last, self.path = np.zeros(2), np.zeros(2)
+
+    def begin(self, place):
+        self.last, self.path = None, []
+
+
 class Towing(Tied):
     """The load hangs on a rope."""
 
@@ -275,6 +342,8 @@ class Towing(Tied):
     ("make", "given", "message"),
     [
         (Ahead, {}, r"notes where it leads to \(goal"),
+        (Beacon, {}, r"notes where it leads to \(mocap_pos\[0\]"),
+        (Twin, {}, r"step\(\) of Twin leads to one x, wherever .* by a second one"),
         (HomeInAClosure, {}, r"notes where it leads to \(away.place\)"),
         (HomeOfWholeNumbers, {}, r"notes where it leads to \(line\)"),
         (HomeOfAKey, {}, r"notes where it leads to \(line\)"),
@@ -504,6 +573,8 @@ def shared_rewards():
         (ServoToAGoal, {"seed": 3}),
         (shared_rewards, {}),
         (Posture, {}),
+        (Muscles, {}),
+        (Renamed, {}),
         (Ahead, PINNED),
     ],
 )

@@ -521,6 +521,37 @@ def test_sensors_that_hold_their_values_are_refused():
         from_gymnasium(Held)
 
 
+class Stamped(Puck):
+    """Computes one part of what it observes once for each time."""
+
+    stamp, seen = 0.0, np.zeros(2)
+
+    def _get_obs(self):
+        if self.data.time != self.stamp:
+            self.stamp, self.seen = self.data.time, GOAL - self.data.qpos
+        now = {"to_goal": self.seen if self.data.time else GOAL - self.data.qpos}
+        return super()._get_obs() | now
+
+    def reset(self, **options):
+        self.stamp, self.seen = 0.0, np.zeros(2)
+        return super().reset(**options)
+
+
+def test_what_is_computed_once_for_each_time_is_refused():
+    with pytest.raises(BadInput, match=r"is not what it observes in its state|computes what it"):
+        from_gymnasium(Stamped, steps=60)
+
+
+def test_one_environment_in_place_of_what_makes_it_is_refused():
+    env = Puck()
+    with pytest.raises(
+        BadInput, match=r"this Puck is one environment, .* a function that makes it"
+    ):
+        from_gymnasium(env)
+    with pytest.raises(BadInput, match=r"gives the same environment each time, .* make a new one"):
+        from_gymnasium(lambda: env)
+
+
 # ---- what is honest
 
 
@@ -774,6 +805,47 @@ def test_generators_that_nobody_draws_from_are_like_any_memory():
     found = from_gymnasium(type("Holding", (Rough,), values)).specification
     assert found.memoryless
     assert "episodes" not in found.found
+
+
+class Alarmed(Puck):
+    """Remembers in an event of `threading` whether it has been near the right wall."""
+
+    def __init__(self):
+        super().__init__()
+        self.alarm = threading.Event()
+
+    def reset(self, **options):
+        self.alarm.clear()
+        return super().reset(**options)
+
+    def step(self, action):
+        if self.data.qpos[0] > 0.9:
+            self.alarm.set()
+        return super().step(action * (0.3 if self.alarm.is_set() else 1.0))
+
+
+class Cameras(Puck):
+    """Remembers in a camera of its model how often it has been stepped."""
+
+    def __init__(self):
+        super().__init__()
+        xml = XML.replace("<worldbody>", '<worldbody><camera name="eye"/>')
+        self.model = mujoco.MjModel.from_xml_string(xml)
+        self.data = mujoco.MjData(self.model)
+
+    def step(self, action):
+        self.model.cam_fovy[0] += 1e-3
+        return super().step(action)
+
+
+@pytest.mark.parametrize("make", [Alarmed, Cameras])
+def test_what_events_and_cameras_hold_is_remembered(make):
+    env = make()
+    env.reset(seed=0)
+    before = fingerprint(env, env.model, env.data)
+    env.data.qpos[:] = 1.0, 0.5
+    env.step(np.zeros(2))
+    assert fingerprint(env, env.model, env.data) != before
 
 
 class Hidden(array.array):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copyreg
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -12,26 +14,55 @@ from hyrl_mj.gym_import.fingerprint import DEEPEST, FUNCTIONS, has_no_memory
 
 
 def held(inner: Any, info: dict[str, Any]) -> Iterator[tuple[str, Any, Any]]:
-    """Yields name, owner and key of numbers and words in `info` and in attributes, also within objects."""
+    """Yields name, owner and key of numbers and words in `info` and in attributes, also within objects.
+
+    What an owner holds, `value_at` gives.
+    """
     seen = {id(inner)}
     for kind, owner in (("info", info), ("attribute", getattr(inner, "__dict__", {}))):
         yield from _within(owner, f"{kind} ", seen, 0)
 
 
 def _within(owner: Any, path: str, seen: set[int], depth: int) -> Iterator[tuple[str, Any, Any]]:
-    """Yields names, owners and keys of what a dictionary or a list holds, as `held` does."""
-    for key, value in [*owner.items()] if isinstance(owner, dict) else [*enumerate(owner)]:
+    """Yields names, owners and keys of what a dictionary, a list, or an object with slots holds."""
+    if isinstance(owner, dict):
+        parts = [*owner.items()]
+    elif isinstance(owner, list):
+        parts = [*enumerate(owner)]
+    else:
+        parts = [(name, getattr(owner, name)) for name in _slots(owner) if hasattr(owner, name)]
+    for key, value in parts:
         if isinstance(value, str) or numbers_of(value) is not None:
             yield f"{path}{key}", owner, key
         elif depth < DEEPEST and id(value) not in seen:
             seen.add(id(value))
-            parts = value
+            owners = [value]
             if isinstance(value, tuple | deque):
-                parts = [*value]
+                owners = [[*value]]
             elif not isinstance(value, dict | list):
                 passed = isinstance(value, FUNCTIONS) or has_no_memory(value)
-                parts = {} if passed else getattr(value, "__dict__", {})
-            yield from _within(parts, f"{path}{key}.", seen, depth + 1)
+                owners = [] if passed else [getattr(value, "__dict__", {}), value]
+            for within in owners:
+                yield from _within(within, f"{path}{key}.", seen, depth + 1)
+
+
+def _slots(value: Any) -> list[str]:
+    """Returns the names of the attributes of an object that its `__dict__` does not hold."""
+    return copyreg._slotnames(type(value))  # type: ignore[attr-defined]
+
+
+def value_at(owner: Any, key: Any) -> Any:
+    """Returns what a dictionary, a list or an object holds under a key or a name."""
+    return owner[key] if isinstance(owner, dict | list) else getattr(owner, key)
+
+
+def put_at(owner: Any, key: Any, value: Any) -> None:
+    """Puts a value where `value_at` finds it; what does not change stays."""
+    if isinstance(owner, dict | list):
+        owner[key] = value
+    else:
+        with suppress(AttributeError):  # it is frozen
+            setattr(owner, key, value)
 
 
 def numbers_of(value: Any) -> np.ndarray | None:
@@ -57,16 +88,16 @@ def set_numbers(inner: Any, values: Mapping[str, np.ndarray]) -> None:
     """Sets attributes of an environment to numbers (k,), by name; what is NaN stays as it is."""
     for name, owner, key, numbers in [*_numbers(inner)]:
         if name in values:
-            old, new = owner[key], np.where(np.isnan(values[name]), numbers, values[name])
+            old, new = value_at(owner, key), np.where(np.isnan(values[name]), numbers, values[name])
             if isinstance(old, np.ndarray) and old.flags.writeable:
                 old[...] = new.reshape(old.shape)  # it may be known by several names
             else:
-                owner[key] = like(old, new)
+                put_at(owner, key, like(old, new))
 
 
 def _numbers(inner: Any) -> Iterator[tuple[str, Any, Any, np.ndarray]]:
     for name, owner, key in held(inner, {}):
-        if (numbers := numbers_of(owner[key])) is not None:
+        if (numbers := numbers_of(value_at(owner, key))) is not None:
             yield name.removeprefix("attribute "), owner, key, numbers
 
 

@@ -33,7 +33,7 @@ from hyrl_mj.gym_import.physics import Physics
 PASSED = (
     "mujoco", "dm_control.mujoco", "dm_control.mjcf", "dm_control.rl.specs", "dm_env", "OpenGL",
     "gymnasium.spaces", "gymnasium.envs.registration", "gymnasium.envs.mujoco.mujoco_rendering",
-    "lxml", "xml", "logging", "re", "_thread", "threading", "weakref", "hyrl_mj",
+    "lxml", "xml", "logging", "re", "_thread", "weakref", "hyrl_mj",
 )  # fmt: skip
 # Packages whose modules and classes hold no memory of an episode.
 LIBRARIES = {
@@ -45,7 +45,7 @@ DEEPEST, MOST = 10, 100_000
 # Parts of MuJoCo's model that say how it moves, by the first words of their names.
 MOVES = (
     "qpos", "body_", "jnt_", "dof_", "geom_", "site_", "tendon_", "wrap_", "actuator_", "sensor_", "eq_",
-    "pair_", "exclude_", "numeric_data", "hfield_data", "flex_",
+    "pair_", "exclude_", "numeric_data", "hfield_data", "flex_", "cam_", "key_",
 )  # fmt: skip
 GENERATORS = np.random.Generator, np.random.RandomState, np.random.BitGenerator, random.Random
 PLAIN = (type(None), bool, int, float, complex, str, bytes)

@@ -39,7 +39,7 @@ from hyrl_mj.gym_import.pool import Pool
 from hyrl_mj.gym_import.resets import resets_of
 from hyrl_mj.gym_import.specification import Criterion
 from hyrl_mj.gym_import.starts import check_noted
-from hyrl_mj.gym_import.uses import check_told, check_use, senses
+from hyrl_mj.gym_import.uses import check_copied, check_told, check_use, senses
 from hyrl_mj.physics import mjcf
 from hyrl_mj.sets import Chart
 
@@ -72,6 +72,11 @@ def inspect(description: Description, untried: bool = False) -> tuple[Pool, Inst
             "tries it within limits of time and memory: open it once in the main process of a program"
         )
     instance = Instance(pool.spec)
+    if made(description).unwrapped is instance.inner:
+        raise BadInput(
+            f"{description.name} gives the same environment each time, and episodes are played by several: "
+            "let it make a new one"
+        )
     _check_times(instance)
     instance.reset()
     _learn_spaces(instance)
@@ -89,6 +94,7 @@ def inspect(description: Description, untried: bool = False) -> tuple[Pool, Inst
     pool.learn(instance.spec)
     trials.check_episodes(pool)
     check_use(instance.spec)
+    check_copied(instance.spec)
     derived, late = trials.derived_of(instance)
     if late:
         instance.spec.found["lag"] = f"observation {', '.join(map(str, late))} {LAG[derived]}"

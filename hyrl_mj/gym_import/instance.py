@@ -504,10 +504,13 @@ class Instance:
         self.physics.come_back()
         return seen
 
-    def recalls(self, fresh: Instance, state: np.ndarray) -> np.ndarray:
-        """Returns which columns (o,) it observes in a state (S,) otherwise than one that was only reset."""
-        seen = self.seen_as("now", state, np.zeros(self.spec.dimension))
-        fresh.physics.write(state)
+    def recalls(self, fresh: Instance, state: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """Returns which columns (o,) it observes otherwise than one that was only reset.
+
+        Both observe in a state (S,) with noise (d,) on the coordinates of the chart.
+        """
+        seen = self.seen_as("now", state, noise)
+        fresh.physics.write(self.moved(state, noise))
         usual = flat(fresh.watched(), self.inner.observation_space)
         return np.asarray((seen != usual) & ~(np.isnan(seen) & np.isnan(usual)))
 

@@ -62,7 +62,12 @@ class Description:
     seed: int | None = None
 
     def __post_init__(self) -> None:
-        chart, noisy = self.chart, self.noisy
+        chart, noisy, name = self.chart, self.noisy, type(self.env).__name__
+        if isinstance(self.env, gym.Env):
+            raise BadInput(
+                f"this {name} is one environment, and episodes are played by several: give a function that "
+                "makes it, as lambda: gymnasium.make(...)"
+            )
         names = chart.values() if isinstance(chart, Mapping) else chart
         if chart is not None and not isinstance(chart, str) and not _all(names, str):
             raise refused(

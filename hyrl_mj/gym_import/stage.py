@@ -295,7 +295,8 @@ def judge(run: Played, real: Instance, noise: np.ndarray, fresh: Instance | None
         known = len(samples) > 1 and np.isfinite(sample.state).all()
         if fresh is None or not (heard and noise.any() and known):
             continue
-        if (stored := real.recalls(fresh, sample.state) & ~spec.recalled).any():
+        shown = noise[len(samples) - 1]
+        if (stored := real.recalls(fresh, sample.state, shown) & ~spec.recalled).any():
             raise BadInput(
                 f"observation[{stored.argmax()}] of {real.name} is not what it observes in its state, after "
                 f"{len(samples) - 1} sample(s): step() has stored it on the way, as a sensor that measures "

@@ -13,10 +13,19 @@ from functools import partial
 from itertools import chain
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.gym_import.attributes import held, like, numbers_in, numbers_of, set_numbers
+from hyrl_mj.gym_import.attributes import (
+    held,
+    like,
+    numbers_in,
+    numbers_of,
+    put_at,
+    set_numbers,
+    value_at,
+)
 from hyrl_mj.gym_import.coordinates import own_of
 from hyrl_mj.gym_import.fingerprint import differing, shared_variables
 from hyrl_mj.gym_import.instance import Instance, Seen, renewed, to_end
@@ -53,10 +62,27 @@ def check_noted(spec: EnvironmentSpec, resets: Resets) -> None:
     _check_following(spec, resets)
     _check_led(spec)
     _check_natural(spec, resets)
+    _check_begun(spec)
 
 
 def _starts(spec: EnvironmentSpec, rng: np.random.Generator) -> np.ndarray:
     return spec.state_at(spec.anywhere(rng, EPISODES))
+
+
+def _check_begun(spec: EnvironmentSpec) -> None:
+    """Raises `BadInput` if a first sample leads to one place, wherever on the chart a run begins."""
+    rng, instance, ends = np.random.default_rng(11), Instance(spec), list[np.ndarray]()
+    starts, inputs, none = _starts(spec, rng), [instance.drawn(rng)], np.zeros((2, spec.dimension))
+    for state in starts:
+        instance = renewed(instance)
+        *_, last = instance.play(state, inputs, none)
+        ends.append(last.state)
+    apart, stays = (np.ptp(spec.z(np.array(states)), axis=0) > 0 for states in (starts, ends))
+    for c in np.array(spec.coordinates, dtype=object)[apart & ~stays]:
+        raise BadInput(
+            f"step() of {spec.name} leads to one {c.name}, wherever on the chart a run begins: it goes by "
+            "something else than MuJoCo's state in its attribute data, as by a second one; let it step that"
+        )
 
 
 def _check_ties(spec: EnvironmentSpec, resets: Resets) -> None:
@@ -253,7 +279,8 @@ def _setpoints(instance: Instance, state: np.ndarray, now: np.ndarray) -> np.nda
         lengths.append(data.actuator_length.copy())
     moved = now.copy()
     gain, bias = model.actuator_gainprm[:, 0], model.actuator_biasprm[:, 1]
-    for i in np.flatnonzero((model.actuator_biastype != 0) & (gain != 0) & (bias != 0)):
+    affine = model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE
+    for i in np.flatnonzero(affine & (gain != 0) & (bias != 0)):
         kind, at = "ctrl", model.actuator_ctrladr[i]
         if model.actuator_dyntype[i] and model.actuator_actadr[i] >= 0:
             kind, at = "act", model.actuator_actadr[i]
@@ -279,21 +306,27 @@ def _check_led(spec: EnvironmentSpec) -> None:
     """Raises `BadInput` if runs depend on what a reset computes of the place in MuJoCo that it leads to."""
     rng, usual, led = np.random.default_rng(11), Instance(spec), Instance(spec)
     none = np.zeros((spec.max_steps, spec.dimension))
+    own = np.append(own_of(usual), usual.physics.columns["warmstart"])
     for state in _starts(spec, rng):
         inputs = [usual.drawn(rng)] * spec.max_steps
         usual, led = map(renewed, (usual, led))
         usual.put(state)
-        led.follow = _Leading(led, state)
+        led.follow, led.own = _Leading(led, state), own  # all else in MuJoCo as the reset leaves it
         try:
-            led.put(state)
+            led.put(state, spec.description.seed or 0)
         except BadInput:  # it cannot begin there
             continue
+        finally:
+            led.own = None
         noted = differing(led.memory(), usual.memory())
+        states = led.physics.read(), usual.physics.read()
+        moved = ~np.isclose(*states, rtol=SAME, atol=SAME)
+        noted += [usual.physics.names[at] for at in np.flatnonzero(moved)]
         if not noted:
             return
         if usual.physics.depth(spec.solid) <= spec.depth:
             ours, theirs = (one.goes_on(inputs, none) for one in (usual, led))
-            _check_alike(spec, ours, theirs, noted[:1], since=1)
+            _check_alike(spec, ours, theirs, noted[:1], since=1, rounding=SAME)
 
 
 class _Leading:
@@ -380,15 +413,11 @@ def _homes(instance: Instance) -> dict[str, tuple[Any, Any, list[int]]]:
     at, nq = [c.index for c in instance.spec.coordinates if c.kind == "qpos"], instance.model.nq
     found = dict[str, tuple[Any, Any, list[int]]]()
     for name, owner, key in (*held(instance.inner, {}), *shared_variables(instance.env)):
-        numbers = numbers_of(_value(owner, key))
+        numbers = numbers_of(value_at(owner, key))
         if numbers is not None and len(at) <= len(numbers) <= nq:
             found[name] = owner, key, at if len(numbers) == nq else [*range(len(at))]
     keys = [nq * row + i for row in range(instance.model.nkey) for i in at]
     return {**found, "key_qpos": (instance.model, "key_qpos", keys)} if keys else found
-
-
-def _value(owner: Any, key: Any) -> Any:
-    return owner[key] if isinstance(owner, dict | list) else getattr(owner, key)
 
 
 def _resets_moved(instance: Instance, name: str, by: np.ndarray) -> bool:
@@ -396,8 +425,12 @@ def _resets_moved(instance: Instance, name: str, by: np.ndarray) -> bool:
 
     Afterwards these are back.
     """
-    owner, key, at = _homes(instance)[name]
-    old = _value(owner, key)
+    if (
+        home := _homes(instance).get(name)
+    ) is None:  # a reset holds it otherwise than a constructor
+        return False
+    owner, key, at = home
+    old = value_at(owner, key)
     numbers = np.array(numbers_of(old), dtype=float)
     numbers[at] += np.resize(by, len(at))
     in_place = isinstance(old, np.ndarray) and old.dtype.kind == "f" and old.flags.writeable
@@ -405,7 +438,7 @@ def _resets_moved(instance: Instance, name: str, by: np.ndarray) -> bool:
     if in_place:
         old[...] = numbers.reshape(old.shape)  # it may be known by several names
     else:
-        _put(owner, key, like(old, numbers.tolist()))
+        put_at(owner, key, like(old, numbers.tolist()))
     instance.follow = _Leading(instance, None)
     try:
         instance.reset()
@@ -416,12 +449,5 @@ def _resets_moved(instance: Instance, name: str, by: np.ndarray) -> bool:
         if in_place:
             old[...] = kept
         else:
-            _put(owner, key, old)
+            put_at(owner, key, old)
     return True
-
-
-def _put(owner: Any, key: Any, value: Any) -> None:
-    if isinstance(owner, dict | list):
-        owner[key] = value
-    else:
-        setattr(owner, key, value)

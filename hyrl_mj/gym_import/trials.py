@@ -138,7 +138,7 @@ def check_observer(spec: EnvironmentSpec) -> np.ndarray:
                         "asked for where noise shows the robot: let it only read"
                     )
             seen = instance.seen_as("now", spec.state, none)
-            recalled = recalled | instance.recalls(fresh, spec.state)
+            recalled = recalled | instance.recalls(fresh, spec.state, none)
             off = _apart(seen, usual.setdefault(k, seen))
             if off.any():
                 column = int((off != 0).argmax())

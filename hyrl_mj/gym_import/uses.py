@@ -9,14 +9,17 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.gym_import.attributes import held, numbers_of
-from hyrl_mj.gym_import.instance import Instance, Seen, to_end
+from hyrl_mj.gym_import.attributes import held, numbers_of, put_at, value_at
+from hyrl_mj.gym_import.coordinates import own_of
+from hyrl_mj.gym_import.instance import Instance, Seen, renewed, to_end
 from hyrl_mj.gym_import.observations import flat
+from hyrl_mj.gym_import.resets import SAME
 from hyrl_mj.gym_import.specification import Derived, EnvironmentSpec
 from hyrl_mj.gym_import.trials import EPISODES, HELD, PLACES, SAMPLES
 
@@ -127,6 +130,58 @@ def check_use(spec: EnvironmentSpec) -> None:
                 )
             if ended or any(ends):
                 break
+
+
+def check_copied(spec: EnvironmentSpec) -> None:
+    """Raises `BadInput` if what is observed shows the place by what code copies into MuJoCo's state.
+
+    A copy, as of a camera that is put above the robot, is moved by as much as the robot, whatever it was
+    before. Noise on the chart does not reach it.
+    """
+    rng, one, step = np.random.default_rng(15), Instance(spec), spec.nudge
+    columns, far = one.physics.columns, float(step.max())
+    parts = ("qpos", "qvel", "ctrl", "mocap_pos", "mocap_quat", "userdata")  # but for forces
+    others = np.setdiff1d(np.concatenate([columns[part] for part in parts]), own_of(one))
+    for i, z in enumerate(spec.anywhere(rng, EPISODES if len(others) else 0)):
+        inputs = [one.drawn(rng)] * (HELD if i % 2 else 1)
+        none = np.zeros((len(inputs) + 1, spec.dimension))
+        usual, elsewhere = spec.state_at(np.array([z, z + step]))
+        before = usual.copy()
+        before[others] += far
+        runs = list[list[Seen]]()
+        for start in (usual, elsewhere, before):
+            one = renewed(one)
+            runs.append([*to_end(one.play(start, inputs, none))])
+        if len({len(run) for run in runs}) > 1:
+            continue
+        here, there, after = (run[-1].state for run in runs)
+        by = np.append(step, (there - here)[spec.places])
+        moved = np.abs((there - here)[others, None] - by[by != 0]) <= SAME * far
+        copies = others[moved.any(axis=1) & (np.abs(after - here)[others] <= SAME * far)]
+        if not len(copies):
+            continue
+        other, one = here.copy(), renewed(one)
+        other[copies] = there[copies]
+        one.tamper = partial(_write, one, here, other)
+        *_, shown = one.play(usual, inputs[: len(runs[0]) - 1], none[: len(runs[0])])
+        one.tamper = None
+        seen = [one.seen_as("now", state, none[0]) for state in (here, other)]
+        pairs = seen, (shown.observation, runs[0][-1].observation)
+        if not all(np.array_equal(a, b, equal_nan=True) for a, b in pairs):
+            names = ", ".join(one.physics.names[at] for at in copies[:4])
+            raise BadInput(
+                f"what {spec.name} observes shows {names}, to which code copies the place of the robot, "
+                "where noise does not reach it: let it observe the place itself"
+            )
+
+
+def _write(
+    instance: Instance, usual: np.ndarray, other: np.ndarray, rest: tuple[Any, ...]
+) -> tuple[Any, ...]:
+    """Shows wrappers another state (S,) of MuJoCo in place of one; returns what they get beside it."""
+    if np.array_equal(instance.physics.read(), usual, equal_nan=True):
+        instance.physics.write(other)
+    return rest
 
 
 # ---- wrappers
@@ -253,10 +308,10 @@ def _run(
         new = changes[len(told)] if len(told) < len(changes) else {}
         *ends, info = *rest[:-1], dict(rest[-1])  # nothing but the info of a reset
         places = [*held(instance.inner, info)]
-        told.append({name: copy.deepcopy(owner[key]) for name, owner, key in places})
+        told.append({name: copy.deepcopy(value_at(owner, key)) for name, owner, key in places})
         for name, owner, key in places:
             if name in new:
-                owner[key] = copy.deepcopy(new[name])
+                put_at(owner, key, copy.deepcopy(new[name]))
         if ends:
             told[-1][REWARD] = ends[0]
             ends[0] = new.get(REWARD, ends[0])

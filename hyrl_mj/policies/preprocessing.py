@@ -172,14 +172,16 @@ class Preprocessing:
     def __bool__(self) -> bool:
         return self.normalization is not None or self.n_stack > 1
 
-    def __call__(self, frames: np.ndarray) -> np.ndarray:
+    def __call__(self, frames: np.ndarray, kind: str = "float32") -> np.ndarray:
         """Returns what an agent sees (n, n_stack k) of its last observations (n, n_stack, k), oldest first.
+
+        These are rounded to the `kind` of floats in which its environment gives them.
 
         Observations before the start are NaN; the agent sees zeros there, as after a reset of
         `VecFrameStack`.
         """
         n, stack, k = frames.shape
-        frames = frames.astype(np.float32)  # as an environment gives them
+        frames = frames.astype(kind)
         normalize = self.normalization
         if normalize is not None and len(normalize.mean) == k:
             frames = normalize(frames)
@@ -212,7 +214,12 @@ class PreprocessedPolicy(ObservationPolicy):
 
     def inputs(self, observation: np.ndarray) -> np.ndarray:
         frames = np.repeat(observation[:, None], self.preprocessing.n_stack, axis=1)
-        return self.policy.inputs(self.preprocessing(frames))
+        return self.policy.inputs(self._seen(frames))
+
+    def _seen(self, frames: np.ndarray) -> np.ndarray:
+        """Returns what the agent sees (n, n_stack k) of observations (n, n_stack, k), oldest first."""
+        is_double = self.task.observation_dtype == "float64"
+        return self.preprocessing(frames, "float64" if is_double else "float32")
 
     def start(self, n: int) -> np.ndarray:
         frames = self.preprocessing.n_stack - 1 if self.remembers else 0
@@ -221,7 +228,7 @@ class PreprocessedPolicy(ObservationPolicy):
     def act_after(self, memory: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         observation = self.task.observation(self.task.check_measurement(measured))
         frames = np.concatenate([memory, observation[:, None]], axis=1)
-        return self.policy.inputs(self.preprocessing(frames)), frames[:, 1:]
+        return self.policy.inputs(self._seen(frames)), frames[:, 1:]
 
 
 def as_function(policy: Policy) -> Policy:
