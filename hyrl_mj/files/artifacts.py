@@ -34,6 +34,8 @@ REMEDY = "run the stage that writes it again"
 
 # Limits on what is read [bytes], so that a crafted file cannot fill the memory.
 LARGEST_JSON, LARGEST = 2**22, 2**27
+# Lists and objects of a JSON file, each of which takes 200 bytes or so.
+MOST_PARTS = 20_000
 # Rows of an array that stands for a tuple, of which there is one for each mode.
 MOST_ROWS = 1_000
 # The names of temporary files, which only a process that was killed leaves behind.
@@ -178,6 +180,8 @@ def parsed_json(
     text: str, kind: str, parse: Callable[[dict[str, Any]], Record], remedy: str = REMEDY
 ) -> Record:
     """Returns what `read_json` does, of the text of a file."""
+    if text.count("[") + text.count("{") > MOST_PARTS:
+        raise BadArtifact(f"it has more than {MOST_PARTS:,} parts, which no such file has")
     whole = json.loads(text)
     if not isinstance(whole, dict):
         raise BadArtifact("it holds no JSON object")

@@ -111,6 +111,7 @@ def compare(
     compared.opened(folder, fresh)
     with locked(folder):
         found = compared.opened(folder, fresh)
+        found.save(folder)  # from now on it can be resumed
         for seed, one in zip(options.seeds, of_runs, strict=True):
             open_ = [n for n in chosen if (r := found.row(n, seed)) is None or r.state == "open"]
             if not open_:

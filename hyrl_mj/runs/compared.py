@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from math import nan
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from hyrl_mj.errors import BadInput
+from hyrl_mj.errors import LARGEST_NUMBER, LONGEST, BadArtifact, BadInput
 from hyrl_mj.files import artifacts
 from hyrl_mj.files.manifest import may_hold
 from hyrl_mj.runs.improvement import LEAST_SEEDS
 
 NAME = "compare.json"
+# Rows, alternatives, settings that one of them tried, and characters of a title.
+MOST_ROWS, MOST_NAMES, MOST_TRIED, LONGEST_TITLE = 1_000, 50, 20, 100
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,21 @@ class Row:
     samples: int = 0
     seconds: float = 0.0
     figures: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def why_not(self) -> str | None:
+        """What of it, as a file has it, no comparison writes; None if nothing."""
+        if len(self.tried) > MOST_TRIED:
+            return f"more than {MOST_TRIED} settings of one alternative"
+        if len(self.title) > LONGEST_TITLE or any(
+            len(text) > 2 * LONGEST for text in (self.name, self.sentence, *self.tried)
+        ):
+            return "a title or a sentence that is too long"
+        values = (self.seconds, *self.tried.values(), *self.figures.values())
+        whole = 0 <= self.seed < 2**32 and 0 <= self.samples <= LARGEST_NUMBER
+        if not whole or any(abs(value) > LARGEST_NUMBER for value in values):
+            return "a number that cannot be right"
+        return None
 
 
 @dataclass(frozen=True)
@@ -87,13 +105,15 @@ class Compared:
         """Returns by how much more of a figure HyRL has than an alternative, and its 95% interval.
 
         It is the mean over the seeds that both have, and a bootstrap over them; no interval with fewer than
-        three.
+        three, and NaN if they have none in common.
         """
         from scipy.stats import bootstrap  # slow to import, and seldom needed
 
         hyrl, other = ({r.seed: r.figures.get(figure) for r in self.of(n)} for n in ("hyrl", name))
         pairs = ((hyrl[seed], other[seed]) for seed in hyrl.keys() & other.keys())
         apart = np.array([a - b for a, b in pairs if a is not None and b is not None])
+        if not len(apart):
+            return nan, None
         if len(apart) < LEAST_SEEDS or not np.ptp(apart):
             return float(apart.mean()), None
         found = bootstrap(
@@ -112,9 +132,19 @@ class Compared:
 
     @staticmethod
     def load(folder: Path) -> Compared:
-        """Reads `compare.json` in a folder; raises `BadArtifact` if there is none, or it is damaged."""
+        """Reads `compare.json` in a folder; raises `BadArtifact` if there is none, or it cannot be right."""
         remedy = "give the folder of a comparison, or make one with hyrl-mj compare TASK --out DIR"
-        return artifacts.read_record(folder / NAME, "comparison", Compared, remedy)
+        found = artifacts.read_record(folder / NAME, "comparison", Compared, remedy)
+        rows = found.rows
+        if len(rows) > MOST_ROWS or len(found.names) > MOST_NAMES:
+            why = f"more than {MOST_ROWS:,} rows of {MOST_NAMES} alternatives"
+        elif len({(row.name, row.seed) for row in rows}) < len(rows):
+            why = "an alternative twice with one seed"
+        elif why_nots := [*filter(None, (row.why_not for row in rows))]:
+            why = why_nots[0]
+        else:
+            return found
+        raise BadArtifact(f"{folder / NAME} has {why}: {remedy}")
 
 
 def opened(folder: Path, fresh: Compared) -> Compared:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from textwrap import fill as fill_text
 
 import numpy as np
 from matplotlib import style as matplotlib_style
@@ -44,7 +45,9 @@ def draw(compared: Compared) -> Figure:
                     values.mean(), at, marker, color=colour, markerfacecolor=face,
                     markersize=7 if filled else 5,
                 )  # fmt: skip
-        panel.set_yticks(range(len(names)), [compared.of(name)[0].title for name in names])
+        panel.set_yticks(
+            range(len(names)), [fill_text(compared.of(name)[0].title, 40) for name in names]
+        )
         for tick, name in zip(panel.get_yticklabels(), names, strict=True):
             tick.set_fontweight("bold" if name == "hyrl" else "normal")
         panel.set(xlim=(-2, 102), ylim=(-0.6, len(names) - 0.4), xlabel="starts won [%]")

@@ -89,11 +89,11 @@ def tried_table(compared: Compared) -> Table | None:
 def sentences(compared: Compared) -> Iterator[str]:
     """Yields how HyRL compares with the best alternative, and which ones could not be compared."""
     others = [n for n in ranked(compared) if n not in ("hyrl", "policy")]
-    if others and compared.of("hyrl"):
+    value, interval = compared.difference(others[0], "worst") if others else (np.nan, None)
+    if np.isfinite(value):
         best = others[0]
         title = compared.of(best)[0].title
         wins, hyrl = (f"{100 * _middle(compared, n, 'worst'):.2f}%" for n in (best, "hyrl"))
-        value, interval = compared.difference(best, "worst")
         between = ""
         if interval is not None:
             low, high = (f"{100 * end:+.2f}" for end in interval)
