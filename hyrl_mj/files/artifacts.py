@@ -40,9 +40,9 @@ MOST_PARTS = 20_000
 MOST_ROWS = 1_000
 # The names of temporary files, which only a process that was killed leaves behind.
 TEMPORARY = re.compile(r"\..+\.[0-9a-f]{12}\.partial(\.\w+)?")
-# Called with each path before `replacing` writes it.
-before_writing: ContextVar[Callable[[Path], None]] = ContextVar(
-    "before_writing", default=lambda path: None
+# Called with each path, and its temporary file, before `replacing` writes it; returns whether it is new.
+before_writing: ContextVar[Callable[[Path, Path], bool]] = ContextVar(
+    "before_writing", default=lambda path, temporary: False
 )
 
 
@@ -50,7 +50,8 @@ before_writing: ContextVar[Callable[[Path], None]] = ContextVar(
 def replacing(path: Path) -> Iterator[Path]:
     """Yields a new temporary file beside `path`, and renames it to `path` if the block ends without error.
 
-    Each writer has a temporary file of its own, and no link is followed.
+    Each writer has a temporary file of its own, and no link is followed. What others put in the place of a
+    file that is new, by `before_writing`, stays.
 
     Raises:
         BadInput: the path cannot be written.
@@ -62,8 +63,8 @@ def replacing(path: Path) -> Iterator[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
         os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
         yield temporary
-        before_writing.get()(path)
-        temporary.replace(path)
+        if not (before_writing.get()(path, temporary) and _linked(temporary, path)):
+            temporary.replace(path)
     except BrokenPipeError:  # the program that writes the file has died
         raise
     except OSError as error:
@@ -71,6 +72,21 @@ def replacing(path: Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def _linked(temporary: Path, path: Path) -> bool:
+    """Returns whether a file has the name of `path`, too, by now; some file systems have no links.
+
+    Raises:
+        FileExistsError: another file has it.
+    """
+    try:
+        os.link(temporary, path)
+    except FileExistsError:
+        raise
+    except OSError:
+        return False
+    return True
 
 
 def not_writable(path: Path, error: OSError) -> BadInput:

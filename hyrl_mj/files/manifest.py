@@ -108,12 +108,13 @@ class Manifest:
         with locked(self.folder):
             written: list[Path] = []
 
-            def before_writing(path: Path) -> None:
+            def before_writing(path: Path, temporary: Path) -> bool:
                 if re.fullmatch(FILES[stage], self._name(path)):
                     written.append(path)
                     entries = self._entries()
                     if entries.pop(stage, None):  # from now on its files do not belong together
                         self._write(entries)
+                return False
 
             read: dict[str, str] = {}
             tokens = _read.set(read), artifacts.before_writing.set(before_writing)
