@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from hyrl_mj.tasks import Task
 
 TIMES = ("t", "time")
-COLUMNS = 500  # that are looked at, each of which takes some 10 ms
-MOST = 20_000_000  # samples with gaps between them, which take 160 MB a column and step
+COLUMNS = 200  # that are looked at, each of which takes some 20 ms
+MOST = 1_200_000  # samples with gaps between them, of which a column takes 150 bytes each
 
 
 @dataclass(frozen=True)
