@@ -96,7 +96,7 @@ class Manifest:
     def stage(self, stage: str) -> Iterator[None]:
         """Records a stage, which reads files with `checked` and writes its own in this block.
 
-        Other files that it has recorded before are removed at the end of the block. A block that writes nothing
+        Other files that it has recorded before are removed at the end. A block that writes nothing
         changes nothing.
 
         Args:

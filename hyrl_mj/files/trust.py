@@ -25,7 +25,7 @@ from filelock import FileLock, Timeout
 from hyrl_mj.errors import BadInput
 from hyrl_mj.files import artifacts
 from hyrl_mj.files.artifacts import digest, replacing
-from hyrl_mj.files.sources import digest_of
+from hyrl_mj.files.sources import digest_of, modules_in
 
 # The records hold hashes of files by path, and of texts and written files by these keys: of each as many.
 TEXTS, WRITTEN, MOST = "texts", "written", 1_000
@@ -122,7 +122,7 @@ def _digest(path: Path) -> str:
     """Returns the SHA-256 of a file; of code with all that is imported with it from its folder or package."""
     if path.suffix != ".py":
         return digest(path)
-    parts = sorted(path.parent.rglob("*.py")) if path.name == "__init__.py" else []
+    parts = modules_in(path.parent) if path.name == "__init__.py" else []
     return sha256("".join([digest_of(path), *map(digest, parts)]).encode()).hexdigest()
 
 
