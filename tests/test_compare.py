@@ -455,7 +455,7 @@ def test_a_comparison_that_nobody_makes_is_refused(rows, tmp_path):
 
 def test_a_json_file_has_a_limit_of_parts(tmp_path):
     Compared("unit_circle", 0.1, "fast", {"a": [[]] * 20_000}, True).save(tmp_path)
-    with pytest.raises(artifacts.BadArtifact, match="more than 20,000 parts"):
+    with pytest.raises(artifacts.BadArtifact, match="more than 10,000 parts"):
         Compared.load(tmp_path)
 
 

@@ -35,7 +35,7 @@ REMEDY = "run the stage that writes it again"
 # Limits on what is read [bytes], so that a crafted file cannot fill the memory.
 LARGEST_JSON, LARGEST = 2**22, 2**27
 # Lists and objects of a JSON file, each of which takes 200 bytes or so.
-MOST_PARTS = 20_000
+MOST_PARTS = 10_000
 # Rows of an array that stands for a tuple, of which there is one for each mode.
 MOST_ROWS = 1_000
 # The names of temporary files, which only a process that was killed leaves behind.
