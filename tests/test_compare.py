@@ -479,6 +479,46 @@ def test_wrong_values_are_a_sentence_each(result, folder, tmp_path):
     assert error.count("\n") == 1
 
 
+def test_a_comparison_that_ended_before_its_first_row_is_resumed(tmp_path, monkeypatch):
+    def ended(*arguments, **options):
+        (tmp_path / "compare" / "hyrl-0").mkdir(exist_ok=True)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(comparing, "run", ended)
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            hyrl_mj.compare("unit_circle", out=tmp_path / "compare", say=len)
+
+
+def many(**more):
+    return tuple(Row(f"{i}", "Many", 0, "done", **more) for i in range(51))
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        many(),
+        2 * (Row("held", "Held", 0),),
+        (Row("held", "H" * 101, 0),),
+        (Row("held", "Held", 0, sentence="a" * 2_000),),
+        (Row("held", "Held", -1),),
+        (Row("held", "Held", 0, samples=10**400),),
+        (Row("held", "Held", 0, figures={"worst": np.inf}),),
+        (Row("held", "Held", 0, tried=dict.fromkeys(map(str, range(21)), 0.5)),),
+    ],
+)
+def test_a_comparison_that_nobody_makes_is_refused(rows, tmp_path):
+    Compared("unit_circle", 0.1, "fast", {}, True, rows).save(tmp_path)
+    with pytest.raises(artifacts.BadArtifact, match=r"compare\.json has"):
+        Compared.load(tmp_path)
+
+
+def test_a_json_file_has_a_limit_of_parts(tmp_path):
+    Compared("unit_circle", 0.1, "fast", {"a": [[]] * 20_000}, True).save(tmp_path)
+    with pytest.raises(artifacts.BadArtifact, match="more than 10,000 parts"):
+        Compared.load(tmp_path)
+
+
 def test_a_damaged_comparison_is_refused(tmp_path):
     Compared("unit_circle", 0.1, "fast", {}, True).save(tmp_path)
     content = json.loads((tmp_path / "compare.json").read_text())
@@ -515,6 +555,13 @@ def test_an_alternative_that_wins_stands_first(three):
     assert table.rows[0][0] == "Stack"
     assert "98.33% (95.00% to all tried)" in table.rows[0]
     assert tried_table(three) is None
+
+
+def test_of_alternatives_without_a_seed_in_common_nothing_is_said(three):
+    apart = replace(
+        three, rows=tuple(replace(r, seed=r.seed + 3 * (r.name == "stack")) for r in three.rows)
+    )
+    assert [*sentences(apart)] == ["Table, seed 0: the chart has 5 dimensions."]
 
 
 def test_without_three_seeds_there_is_no_interval(three):

@@ -1,5 +1,6 @@
 """What a stranger wrote runs no code, takes no more than its share, and overwrites nothing."""
 
+import contextlib
 import csv
 import io
 import json
@@ -9,6 +10,7 @@ import socket
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +25,7 @@ from command_line import call
 from hyrl_mj.errors import BadInput
 from hyrl_mj.fields import read_field
 from hyrl_mj.fields.driving import Driving
-from hyrl_mj.files import trust
+from hyrl_mj.files import artifacts, trust
 from hyrl_mj.gym_import import from_gymnasium, making
 from hyrl_mj.gym_import.making import from_spec
 from hyrl_mj.physics import mjcf
@@ -386,18 +388,59 @@ def test_a_long_sentence_is_cut_in_the_middle():
     assert len(text) <= LONGEST + 10
 
 
+def write(path, text):
+    with artifacts.replacing(path) as temporary:
+        temporary.write_text(text)
+
+
 def test_what_was_not_written_here_is_not_overwritten(tmp_path):
     path = tmp_path / "page.html"
     with trust.output(path):
-        path.write_text("ours")
+        write(path, "ours")
     with trust.output(path):  # as it was written
-        path.write_text("ours again")
+        write(path, "ours again")
     path.write_text("theirs")
     with pytest.raises(BadInput, match="--force"), trust.output(path):
         raise AssertionError
     with trust.output(path, force=True):
-        path.write_text("ours")
+        write(path, "ours")
     assert path.read_text() == "ours"
+
+
+@pytest.mark.parametrize("when", ["before", "in between", "after"])
+def test_what_somebody_writes_meanwhile_is_not_overwritten(when, tmp_path, monkeypatch):
+    path, mark = tmp_path / "page.html", trust._mark
+
+    def marked(*paths):  # just before it is written
+        if when == "in between":
+            path.write_text("theirs")
+        return mark(*paths)
+
+    monkeypatch.setattr(trust, "_mark", marked)
+    with contextlib.suppress(BadInput), trust.output(path):
+        if when == "before":
+            path.write_text("theirs")
+        write(path, "ours")
+        path.write_text("theirs")
+    with pytest.raises(BadInput, match="has not written it"), trust.output(path):
+        pass
+    assert path.read_text() == "theirs"
+
+
+def test_what_was_forced_and_failed_is_still_theirs(tmp_path):
+    path = tmp_path / "page.html"
+    path.write_text("theirs")
+    with pytest.raises(ZeroDivisionError), trust.output(path, force=True):
+        raise ZeroDivisionError
+    with pytest.raises(BadInput, match="has not written it"), trust.output(path):
+        pass
+
+
+def test_what_is_recorded_at_the_same_time_is_recorded():
+    texts = [f"text {number}" for number in range(16)]
+    with ThreadPoolExecutor(4) as pool:
+        [*pool.map(trust.remember_text, texts)]
+    assert all(map(trust.is_known_text, texts))
 
 
 @pytest.mark.slow

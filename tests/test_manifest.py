@@ -128,11 +128,13 @@ def test_a_file_that_a_stage_did_without_makes_it_out_of_date_once_it_is_there(f
 
 def test_files_of_an_earlier_run_go_and_others_stay(folder):
     write(folder, "retrain", "mode_0.json", "x")
-    for name in ("mode_7.json", "mode_7.txt", "my_mode_7.json", "arcs/mode_7.json"):
+    for name in ("mode_7.json", "figures/mode_mine.png", "arcs/mode_7.json"):
         put(folder / name, "left")
     write(folder, "retrain", "mode_1.json", "x")
     left = {p.relative_to(folder).as_posix() for p in folder.rglob("*mode*")}
-    assert left == {"mode_1.json", "mode_7.txt", "my_mode_7.json", "arcs/mode_7.json"}
+    assert left == {"mode_1.json", "mode_7.json", "figures/mode_mine.png", "arcs/mode_7.json"}
+    write(folder, "figures", "figures/overview.png", "x")
+    assert (folder / "figures" / "mode_mine.png").exists()
 
 
 @pytest.mark.parametrize("name", ["../victim.json", "/etc/passwd", "config.json", "notes.txt"])

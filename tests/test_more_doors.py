@@ -10,19 +10,22 @@ import resource
 import shutil
 import subprocess
 import sys
+import time
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from attacks import child, crafted_agents
+from attacks import MARKER, child, crafted_agents
+from attacks.folders import plant_modules
 from command_line import call
 from environments import Puck
 from PIL import Image
 
 import hyrl_mj
-from hyrl_mj import BadArtifact, BadInput, from_gymnasium
+from hyrl_mj import BadArtifact, BadInput, HyrlError, from_gymnasium
 from hyrl_mj.cli import parsing
 from hyrl_mj.fields import read_field
 from hyrl_mj.files import artifacts, trust
@@ -36,7 +39,7 @@ from hyrl_mj.policies import agent_at, algorithms
 from hyrl_mj.policies.preprocessing import Normalization
 from hyrl_mj.runs.sweeps import MOST_RUNS, Common, Row, Setting, Sweep
 from hyrl_mj.stages import ExtendedSets
-from hyrl_mj.system import limits
+from hyrl_mj.system import cores, limits
 from hyrl_mj.system.streams import _SEQUENCES, Streams
 from hyrl_mj.tasks import described_task, registry
 from hyrl_mj.tasks.scaffold import write_task
@@ -169,6 +172,40 @@ def test_a_session_in_a_folder_of_a_stranger_takes_no_package_from_it(tmp_path):
     )
     assert done.stdout == "refused\n" * 2
     assert not (tmp_path / "executed").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ended", [False, True])
+def test_processes_of_a_command_import_nothing_and_end_with_it(ended, tmp_path):
+    plant_modules(tmp_path)
+    code = f"""if True:
+        import os, time
+        from hyrl_mj.system import cores
+        with cores.Processes() as pool:
+            print(*pool.map(os.getppid, []), flush=True)
+            for worker in pool.map(eval, ["__import__('os').getpid()"]):
+                print(worker, flush=True)
+            if {ended}:
+                pool.map(time.sleep, [600])
+                os._exit(0)
+    """
+    words = [sys.executable, "-P", "-c", code]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert not (tmp_path / MARKER).exists()
+    for _ in range(100):
+        if not (alive := Path(f"/proc/{int(done.stdout)}").exists()):
+            break
+        time.sleep(0.1)
+    assert not alive
+
+
+def test_a_process_of_a_pool_that_is_ended_is_one_sentence():
+    class Broken:
+        def map(self, work, jobs):
+            raise BrokenProcessPool("a process died")
+
+    with cores.using_pool(Broken()), pytest.raises(HyrlError, match="run it again to resume"):
+        [*cores.in_processes(abs, [1])]
 
 
 def test_the_name_of_a_file_that_is_missing_is_no_module(tmp_path, monkeypatch):

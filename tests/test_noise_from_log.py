@@ -332,6 +332,16 @@ def test_what_is_no_file_or_too_large_is_a_sentence(tmp_path, monkeypatch):
     monkeypatch.setattr(logs, "LARGEST", 2**20)
     (tmp_path / "log.csv").write_bytes(b"1" * (2**20 + 1))
     assert "is larger than 1 MiB" in call("noise", tmp_path / "log.csv").stderr
+    monkeypatch.setattr(logs, "MOST_NUMBERS", 3 * 60)
+    (tmp_path / "log.csv").write_text("t,x,x_ref\n" + ROWS)
+    assert "line 62 is beyond the 60 rows" in call("noise", tmp_path / "log.csv").stderr
+
+
+def test_a_log_of_gaps_alone_has_a_limit(tmp_path):
+    rows = "".join(f"{k + k // 2 * 10_000},{k % 7},{k % 5}\n" for k in range(24_000))
+    (tmp_path / "log.csv").write_text("t,x,x_ref\n" + rows)
+    with pytest.raises(BadInput, match="so many gaps in time"):
+        noise_from_log(tmp_path / "log.csv")
 
 
 def test_a_log_without_times_takes_them_as_an_option(of):

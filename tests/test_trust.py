@@ -114,6 +114,18 @@ def test_a_task_file_that_the_user_has_named_is_known_until_it_changes(robot):
         described_task(str(robot))
 
 
+@pytest.mark.parametrize("name", ["helper.pyc", "helper/__init__.pyc", "helper.abi3.so"])
+def test_a_module_without_source_beside_a_task_file_is_a_part_of_it(name, robot):
+    """Python takes it where the file imports it, a package and an extension before helper.py."""
+    robot.write_text("import helper\n" + robot.read_text())
+    (robot.parent / "helper.py").touch()
+    trust.remember(robot)
+    assert trust.is_known(robot)
+    (robot.parent / name).parent.mkdir(exist_ok=True)
+    (robot.parent / name).write_bytes(b"compiled")
+    assert not trust.is_known(robot)
+
+
 def test_an_algorithm_that_the_user_has_named_is_known(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.py").write_text("raise RuntimeError('imported')\n")

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import shlex
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -174,9 +172,7 @@ def compare(
     if environment.explain:
         print(explained(chosen))
         return
-    # A fork would copy the threads of torch and MuJoCo in whatever state they are.
-    spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(cores.count(), spawn) as pool, cores.using_pool(pool):
+    with cores.Processes() as pool, cores.using_pool(pool):
         result = pipeline.compare(chosen, options)
     print_compared(result)
     folder = options.out or Path("runs") / f"{chosen.name}_compare"

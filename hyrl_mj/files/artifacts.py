@@ -34,13 +34,15 @@ REMEDY = "run the stage that writes it again"
 
 # Limits on what is read [bytes], so that a crafted file cannot fill the memory.
 LARGEST_JSON, LARGEST = 2**22, 2**27
+# Lists and objects of a JSON file, each of which takes 200 bytes or so.
+MOST_PARTS = 10_000
 # Rows of an array that stands for a tuple, of which there is one for each mode.
 MOST_ROWS = 1_000
 # The names of temporary files, which only a process that was killed leaves behind.
 TEMPORARY = re.compile(r"\..+\.[0-9a-f]{12}\.partial(\.\w+)?")
-# Called with each path before `replacing` writes it.
-before_writing: ContextVar[Callable[[Path], None]] = ContextVar(
-    "before_writing", default=lambda path: None
+# Called with each path, and its temporary file, before `replacing` writes it; returns whether it is new.
+before_writing: ContextVar[Callable[[Path, Path], bool]] = ContextVar(
+    "before_writing", default=lambda path, temporary: False
 )
 
 
@@ -48,7 +50,8 @@ before_writing: ContextVar[Callable[[Path], None]] = ContextVar(
 def replacing(path: Path) -> Iterator[Path]:
     """Yields a new temporary file beside `path`, and renames it to `path` if the block ends without error.
 
-    Each writer has a temporary file of its own, and no link is followed.
+    Each writer has a temporary file of its own, and no link is followed. What others put in the place of a
+    file that is new, by `before_writing`, stays.
 
     Raises:
         BadInput: the path cannot be written.
@@ -60,8 +63,8 @@ def replacing(path: Path) -> Iterator[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
         os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
         yield temporary
-        before_writing.get()(path)
-        temporary.replace(path)
+        if not (before_writing.get()(path, temporary) and _linked(temporary, path)):
+            temporary.replace(path)
     except BrokenPipeError:  # the program that writes the file has died
         raise
     except OSError as error:
@@ -69,6 +72,21 @@ def replacing(path: Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def _linked(temporary: Path, path: Path) -> bool:
+    """Returns whether a file has the name of `path`, too, by now; some file systems have no links.
+
+    Raises:
+        FileExistsError: another file has it.
+    """
+    try:
+        os.link(temporary, path)
+    except FileExistsError:
+        raise
+    except OSError:
+        return False
+    return True
 
 
 def not_writable(path: Path, error: OSError) -> BadInput:
@@ -178,6 +196,8 @@ def parsed_json(
     text: str, kind: str, parse: Callable[[dict[str, Any]], Record], remedy: str = REMEDY
 ) -> Record:
     """Returns what `read_json` does, of the text of a file."""
+    if text.count("[") + text.count("{") > MOST_PARTS:
+        raise BadArtifact(f"it has more than {MOST_PARTS:,} parts, which no such file has")
     whole = json.loads(text)
     if not isinstance(whole, dict):
         raise BadArtifact("it holds no JSON object")

@@ -15,8 +15,10 @@ import numpy as np
 from hyrl_mj.errors import LARGEST_NUMBER, BadInput, brief, has_controls
 from hyrl_mj.files import artifacts
 
-LARGEST = 2**26  # [bytes]: a million rows of six columns
+# Bytes of a file, and rows and numbers that are read of it.
+LARGEST, MOST_ROWS, MOST_NUMBERS = 2**26, 1_000_000, 8_000_000
 NEEDED = "give a CSV file with a line of names and a row for each sample"
+FEWER = "give fewer rows, or only the columns that are needed"
 SHOWN = 40  # characters of a cell or a name in a message
 LONGEST, MOST = 200, 10_000  # characters of a name, and names
 
@@ -35,7 +37,10 @@ class Log:
     def __init__(self, path: str | Path):
         if not isinstance(path, str | Path):
             raise BadInput(f"{path!r:.60} is no path of a file: {NEEDED}")
-        self.path, text = path, io.StringIO(_text(Path(path)))
+        self.path, content = path, artifacts.read_given(Path(path), NEEDED, LARGEST, FEWER)
+        if b"\0" in content:
+            raise BadInput(f"{path} is no text: {NEEDED}")
+        text = io.TextIOWrapper(io.BytesIO(content), "utf-8-sig", newline="")
         self._reader = csv.reader(text, strict=True, skipinitialspace=True)
         self.names = [name.strip() for name in next(self._rows(), [])]
         _check(path, self.names)
@@ -48,32 +53,42 @@ class Log:
         """
         values = {name: array("d") for name in names}
         columns = [(self.names.index(name), name, values[name]) for name in names]
-        for row in filter(None, self._rows()):
-            where = f"{self.path}, line {self._reader.line_num}"
-            if len(row) != len(self.names):
+        most = min(MOST_ROWS, MOST_NUMBERS // max(len(columns), 1))
+        for number, row in enumerate(filter(None, self._rows())):
+            if len(row) != len(self.names) or number == most:
+                where, count = f"{self.path}, line {self._reader.line_num}", len(self.names)
+                if number == most:
+                    raise BadInput(
+                        f"{where} is beyond the {most:,} rows of {len(columns)} columns that can be looked "
+                        f"at: {FEWER}"
+                    )
                 raise BadInput(
-                    f"{where} has {len(row)} cells under {len(self.names)} names: give each row as many"
+                    f"{where} has {len(row)} cells under {count} names: give each row as many"
                 )
             for place, name, column in columns:
-                column.append(_number(row[place], where, name))
-        return {name: np.array(column) for name, column in values.items()}
+                column.append(self._number(row[place], name))
+        return {name: np.frombuffer(column) for name, column in values.items()}
+
+    def _number(self, cell: str, name: str) -> float:
+        """Returns the number in a cell, NaN for an empty one, or raises `BadInput`."""
+        try:
+            value = float(cell)
+        except ValueError:
+            value = math.inf if cell.strip() else math.nan
+        if abs(value) > LARGEST_NUMBER:
+            raise BadInput(
+                f"{self.path}, line {self._reader.line_num}: {name[:SHOWN]} is {cell.strip()[:SHOWN]!r}, "
+                f"which is no finite number up to {LARGEST_NUMBER:g}: give one, or leave the cell empty"
+            )
+        return value
 
     def _rows(self) -> Iterator[list[str]]:
         try:
             yield from self._reader
         except csv.Error as error:
             raise BadInput(f"{self.path} is no CSV file ({brief(error)}): {NEEDED}") from None
-
-
-def _text(path: Path) -> str:
-    fewer = "give fewer rows, or only the columns that are needed"
-    try:
-        text = artifacts.read_given(path, NEEDED, LARGEST, fewer).decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = "\0"
-    if "\0" in text:
-        raise BadInput(f"{path} is no text: {NEEDED}")
-    return text
+        except UnicodeDecodeError:
+            raise BadInput(f"{self.path} is no text: {NEEDED}") from None
 
 
 def _check(path: str | Path, header: Sequence[str]) -> None:
@@ -98,18 +113,3 @@ def _check(path: str | Path, header: Sequence[str]) -> None:
         raise BadInput(f"{path} begins with the number {name[:SHOWN]}, not with names: {NEEDED}")
     if twice:
         raise BadInput(f"{path} names the column {twice[0][:SHOWN]!r} twice: give it once")
-
-
-def _number(cell: str, where: str, name: str) -> float:
-    """Returns the number in a cell, NaN for an empty one, or raises `BadInput`."""
-    cell = cell.strip()
-    try:
-        value = float(cell) if cell else math.nan
-    except ValueError:
-        value = math.inf
-    if abs(value) > LARGEST_NUMBER:
-        raise BadInput(
-            f"{where}: {name[:SHOWN]} is {cell[:SHOWN]!r}, which is no finite number up to "
-            f"{LARGEST_NUMBER:g}: give one, or leave the cell empty"
-        )
-    return value

@@ -29,7 +29,7 @@ from hyrl_mj.files.artifacts import digest
 NAME, LOCK = "manifest.json", ".lock"
 LARGEST = 2**20  # [bytes]; a manifest is read many times
 REMEDY = "remove it, and all stages run again"
-# The names of the files that each stage may write: no other file is ever believed or removed.
+# The names of the files that each stage may write: no other file is ever believed.
 FILES = {
     "train": r"policy\.(safetensors|json|onnx)|vecnormalize\.npz|arrivals\.json",
     "critical-set": r"critical_set\.npz",
@@ -96,8 +96,8 @@ class Manifest:
     def stage(self, stage: str) -> Iterator[None]:
         """Records a stage, which reads files with `checked` and writes its own in this block.
 
-        Other files of the stage are removed at the end of the block. A block that writes nothing changes
-        nothing.
+        Other files that it has recorded before are removed at the end. A block that writes nothing
+        changes nothing.
 
         Args:
             stage: one of `FILES`.
@@ -107,13 +107,15 @@ class Manifest:
         """
         with locked(self.folder):
             written: list[Path] = []
+            before = self._entries().get(stage)
 
-            def before_writing(path: Path) -> None:
+            def before_writing(path: Path, temporary: Path) -> bool:
                 if re.fullmatch(FILES[stage], self._name(path)):
                     written.append(path)
                     entries = self._entries()
                     if entries.pop(stage, None):  # from now on its files do not belong together
                         self._write(entries)
+                return False
 
             read: dict[str, str] = {}
             tokens = _read.set(read), artifacts.before_writing.set(before_writing)
@@ -125,10 +127,8 @@ class Manifest:
             if not written:
                 return
             outputs = {self._name(path): digest(path) for path in written}
-            for path in self.folder.glob("**/*"):
-                name = self._name(path)
-                if re.fullmatch(FILES[stage], name) and name not in outputs and path.is_file():
-                    path.unlink()
+            for name in (before.outputs.keys() if before else set()) - outputs.keys():
+                (self.folder / name).unlink(missing_ok=True)
             entry = Entry(self.settings[stage], self.code, read, outputs, version("hyrl-mj"))
             self._write(self._entries() | {stage: entry})
 

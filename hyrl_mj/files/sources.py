@@ -4,9 +4,16 @@ import ast
 import sys
 from functools import lru_cache
 from hashlib import sha256
+from importlib.machinery import all_suffixes
 from pathlib import Path
 
 from hyrl_mj.errors import BadInput
+
+
+def modules_in(folder: Path) -> list[Path]:
+    """Returns the files of the modules in a package, without those that Python itself compiles."""
+    files = (f for f in folder.rglob("*") if f.name.endswith(tuple(all_suffixes())))
+    return sorted(f for f in files if f.is_file() and f.parent.name != "__pycache__")
 
 
 def sources(path: Path) -> list[Path]:
@@ -16,10 +23,12 @@ def sources(path: Path) -> list[Path]:
     found, left = {path: None}, [] if installed else [path]
     while left:
         file = left.pop()
-        for name in _imported(file.read_bytes()):
+        for name in _imported(file.read_bytes()) if file.suffix == ".py" else ():
             for folder in {path.parent, file.parent}:
-                files = [folder / f"{name}.py", *sorted((folder / name).rglob("*.py"))]
-                new = [file for file in files if file.is_file() and file not in found]
+                # Compiled modules, too: Python takes them before those of the same name.
+                files = [folder / f"{name}{suffix}" for suffix in all_suffixes()]
+                files += modules_in(folder / name)
+                new = [f for f in files if f.is_file() and f not in found]
                 found |= dict.fromkeys(new)
                 left += new
     del found[path]
@@ -61,7 +70,7 @@ def forget_helpers(path: Path) -> None:
 def _beside(path: Path) -> set[str]:
     """Returns the names of the modules and packages beside a task that it imports."""
     files = [file.relative_to(path.parent) for file in sources(path)[1:]]
-    return {file.parts[0].removesuffix(".py") for file in files}
+    return {file.parts[0].partition(".")[0] for file in files}
 
 
 @lru_cache(maxsize=1_000)

@@ -20,13 +20,15 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from hyrl_mj.errors import BadInput
-from hyrl_mj.files.artifacts import digest, replacing
-from hyrl_mj.files.sources import digest_of
+from filelock import FileLock, Timeout
 
-# The records hold hashes of files by path, and of texts and written files by keys that are no paths: of each
-# of these two as many.
-MOST = 1_000
+from hyrl_mj.errors import BadInput
+from hyrl_mj.files import artifacts
+from hyrl_mj.files.artifacts import digest, replacing
+from hyrl_mj.files.sources import digest_of, modules_in
+
+# The records hold hashes of files by path, and of texts and written files by these keys: of each as many.
+TEXTS, WRITTEN, MOST = "texts", "written", 1_000
 _received: ContextVar[bool] = ContextVar("received", default=False)
 
 
@@ -120,69 +122,88 @@ def _digest(path: Path) -> str:
     """Returns the SHA-256 of a file; of code with all that is imported with it from its folder or package."""
     if path.suffix != ".py":
         return digest(path)
-    parts = sorted(path.parent.rglob("*.py")) if path.name == "__init__.py" else []
+    parts = modules_in(path.parent) if path.name == "__init__.py" else []
     return sha256("".join([digest_of(path), *map(digest, parts)]).encode()).hexdigest()
 
 
 def remember_text(text: str) -> None:
     """Records that the user has described something by this text."""
     if not is_known_text(text):
-        _record("texts", [*_texts(), _digest_of(text)][-MOST:])
+        _record(TEXTS, _digest_of(text))
 
 
 def is_known_text(text: str) -> bool:
     """Returns whether the user has described something by this text before, on this machine."""
-    return _digest_of(text) in _texts()
+    return _digest_of(text) in _listed(TEXTS)
 
 
 @contextmanager
 def output(*paths: Path, force: bool = False) -> Iterator[None]:
-    """Lets files be written in the block that this machine wrote before, or that are new.
+    """Lets `replacing` write files in the block that this machine wrote before, or that are new.
+
+    It is asked again just before each is written, and what is written is recorded then.
 
     Raises:
         BadInput: there is one that was not written so, and it is not to be overwritten by `force`.
     """
-    known = _written()
-    before = {path: digest(path) for path in paths if path.is_file()}
+
+    def is_new(path: Path) -> bool:
+        if not (path.exists() or path.is_symlink()):  # a link may lead to nothing
+            return True
+        known = path.is_dir() or force or (path.is_file() and _mark(path, path) in _listed(WRITTEN))
+        if not known:
+            raise BadInput(
+                f"{path} exists, and hyrl-mj has not written it as it is: give another --out, or --force to "
+                "overwrite it"
+            )
+        return False
+
+    def before_writing(path: Path, temporary: Path) -> bool:
+        if path not in paths:
+            return False
+        new = is_new(path)
+        _record(WRITTEN, _mark(path, temporary))
+        return new
+
     for path in paths:
-        there = path.exists() or path.is_symlink()  # a link may lead to nothing
-        if there and not path.is_dir() and not force:
-            record = known.get(str(path.resolve()))
-            if record is None or record != before.get(path):
-                raise BadInput(
-                    f"{path} exists, and hyrl-mj has not written it as it is: give another --out, or --force "
-                    "to overwrite it"
-                )
+        is_new(path)
+    token = artifacts.before_writing.set(before_writing)
     try:
         yield
     finally:
-        after = {path: digest(path) for path in paths if path.is_file()}
-        new = {str(p.resolve()): d for p, d in after.items() if before.get(p) != d or force}
-        kept = {path: value for path, value in _written().items() if path not in new} | new
-        _record("written", dict([*kept.items()][-MOST:]))
+        artifacts.before_writing.reset(token)
 
 
-def _written() -> dict[str, str]:
-    known = _records().get("written")
-    return known if isinstance(known, dict) else {}
+def _mark(path: Path, content: Path) -> str:
+    """Returns what stands for the content of a file at a path in the records."""
+    return _digest_of(f"{path.resolve()} {digest(content)}")
 
 
 def _digest_of(text: str) -> str:
     return sha256(text.encode(errors="surrogatepass")).hexdigest()
 
 
-def _texts() -> list[str]:
-    texts = _records().get("texts")
-    return texts if isinstance(texts, list) else []
+def _listed(key: str) -> list[str]:
+    found = _records().get(key)
+    return found if isinstance(found, list) else []
 
 
-def _record(key: str, value: Any) -> None:
-    """Records a value, unless a file asked for it; without a place for records, nothing is kept."""
-    file, records = store(), _records()
-    if file is None or is_received() or records.get(key) == value:
+def _record(key: str, value: str) -> None:
+    """Records a value, in the list of a key that is no path, unless a file asked for it.
+
+    Without a place for records, nothing is kept.
+    """
+    if (file := store()) is None or is_received():
         return
-    with suppress(BadInput), replacing(file) as temporary:
-        temporary.write_text(json.dumps(records | {key: value}, indent=2) + "\n", encoding="utf-8")
+    with suppress(BadInput, OSError, Timeout):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with FileLock(file.with_suffix(".lock"), timeout=5):  # others record theirs
+            records = _records()
+            new = [*_listed(key), value][-MOST:] if key in (TEXTS, WRITTEN) else value
+            if records.get(key) != new:
+                with replacing(file) as temporary:
+                    text = json.dumps(records | {key: new}, indent=2)
+                    temporary.write_text(f"{text}\n", encoding="utf-8")
 
 
 def _records() -> dict[str, Any]:

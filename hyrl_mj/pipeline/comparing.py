@@ -115,6 +115,7 @@ def compare(
     compared.opened(folder, fresh)
     with locked(folder):
         found = _without_outdated(compared.opened(folder, fresh), task, say)
+        found.save(folder)  # from now on it can be resumed
         for seed, one in zip(options.seeds, of_runs, strict=True):
             open_ = [n for n in chosen if (r := found.row(n, seed)) is None or r.state != "done"]
             if not open_:

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from math import nan
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from hyrl_mj.errors import BadInput
+from hyrl_mj.errors import LARGEST_NUMBER, LONGEST, BadArtifact, BadInput
 from hyrl_mj.files import artifacts
 from hyrl_mj.files.manifest import may_hold
 from hyrl_mj.runs.improvement import Mean, mean
 
 NAME = "compare.json"
+# Rows, alternatives, settings that one of them tried, and characters of a title.
+MOST_ROWS, MOST_NAMES, MOST_TRIED, LONGEST_TITLE = 1_000, 50, 20, 100
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,21 @@ class Row:
     seconds: float = 0.0
     figures: dict[str, float] = field(default_factory=dict)
     code: str = ""
+
+    @property
+    def why_not(self) -> str | None:
+        """What of it, as a file has it, no comparison writes; None if nothing."""
+        if len(self.tried) > MOST_TRIED:
+            return f"more than {MOST_TRIED} settings of one alternative"
+        if len(self.title) > LONGEST_TITLE or any(
+            len(text) > 2 * LONGEST for text in (self.name, self.sentence, *self.tried)
+        ):
+            return "a title or a sentence that is too long"
+        values = (self.seconds, *self.tried.values(), *self.figures.values())
+        whole = 0 <= self.seed < 2**32 and 0 <= self.samples <= LARGEST_NUMBER
+        if not whole or any(abs(value) > LARGEST_NUMBER for value in values):
+            return "a number that cannot be right"
+        return None
 
 
 @dataclass(frozen=True)
@@ -86,10 +104,14 @@ class Compared:
         return [row.figures[figure] for row in self.of(name) if figure in row.figures]
 
     def difference(self, name: str, figure: str) -> Mean:
-        """Returns by how much more of a figure HyRL has than an alternative, in the seeds that both have."""
+        """Returns by how much more of a figure HyRL has than an alternative, in the seeds that both have.
+
+        It is NaN if they have none in common.
+        """
         other, hyrl = ({r.seed: r.figures.get(figure) for r in self.of(n)} for n in (name, "hyrl"))
         pairs = [(other[seed], hyrl[seed], 0.0) for seed in other.keys() & hyrl.keys()]
-        return mean([np.array([pair for pair in pairs if None not in pair])], np.array((-1, 1)))
+        both = [pair for pair in pairs if None not in pair]
+        return mean([np.array(both)], np.array((-1, 1))) if both else Mean(nan, None)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -102,9 +124,19 @@ class Compared:
 
     @staticmethod
     def load(folder: Path) -> Compared:
-        """Reads `compare.json` in a folder; raises `BadArtifact` if there is none, or it is damaged."""
+        """Reads `compare.json` in a folder; raises `BadArtifact` if there is none, or it cannot be right."""
         remedy = "give the folder of a comparison, or make one with hyrl-mj compare TASK --out DIR"
-        return artifacts.read_record(folder / NAME, "comparison", Compared, remedy)
+        found = artifacts.read_record(folder / NAME, "comparison", Compared, remedy)
+        rows = found.rows
+        if len(rows) > MOST_ROWS or len(found.names) > MOST_NAMES:
+            why = f"more than {MOST_ROWS:,} rows of {MOST_NAMES} alternatives"
+        elif len({(row.name, row.seed) for row in rows}) < len(rows):
+            why = "an alternative twice with one seed"
+        elif why_nots := [*filter(None, (row.why_not for row in rows))]:
+            why = why_nots[0]
+        else:
+            return found
+        raise BadArtifact(f"{folder / NAME} has {why}: {remedy}")
 
 
 def opened(folder: Path, fresh: Compared) -> Compared:

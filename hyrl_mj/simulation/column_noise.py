@@ -225,15 +225,12 @@ def _correlated(
 
 def _autocorrelation(left: np.ndarray, used: np.ndarray) -> np.ndarray:
     """Returns the autocorrelation, from lag 0 on, of the values (n,) that are used (n,)."""
-    from scipy import signal
-
-    white = np.where(used, left - left[used].mean(), 0.0)
-    sums, counts = (
-        signal.correlate(x, x, method="fft")[len(x) - 1 :][: MOST_LAGS + 1]
-        for x in (white, used.astype(float))
-    )
+    white, n = np.where(used, left - left[used].mean(), 0.0), len(left)
+    lags = range(min(MOST_LAGS + 1, n))
+    sums = np.array([white[lag:] @ white[: n - lag] for lag in lags])
+    counts = np.array([np.count_nonzero(used[lag:] & used[: n - lag]) for lag in lags])
     # Of a few pairs nothing can be told.
-    pairs = np.where(np.rint(counts) >= LEAST, sums / np.maximum(counts, 1), 0.0)
+    pairs = np.where(counts >= LEAST, sums / np.maximum(counts, 1), 0.0)
     return pairs / max(float(pairs[0]), 1e-300)
 
 
@@ -304,15 +301,14 @@ def _delay(
     Raises:
         BadInput: it follows r with the other sign.
     """
-    from scipy import signal, stats
+    from scipy import stats
 
     def left(error: np.ndarray) -> float:
         """Returns the mean square of an error (n,), NaN where it is not used."""
         error = error[fresh & np.isfinite(error)]
         if len(error) < LEAST:
             return np.inf
-        parts = np.linspace(0, len(error), 11).astype(int)[1:-1]
-        return float(np.mean(signal.detrend(_short(error, turn), bp=parts) ** 2))
+        return _square_beside_lines(_short(error, turn))
 
     most = min(LONGEST_DELAY, len(y) // 8)
     lags = np.arange(-most // 10, most + 1)
@@ -342,6 +338,17 @@ def _delay(
         more = float(max(np.ceil(middle), 0))
         return more, [f"{name} is {middle:.1f} samples late, which is taken as {more:.0f}"]
     return float(lags[i]), []
+
+
+def _square_beside_lines(values: np.ndarray) -> float:
+    """Returns the mean square of values (n,) beside a line through each tenth of them."""
+    total = 0.0
+    for part in np.array_split(values, np.linspace(0, len(values), 11).astype(int)[1:-1]):
+        x = np.arange(len(part)) - (len(part) - 1) / 2
+        beside = part - part.mean()
+        beside -= (x @ beside) / (x @ x) * x
+        total += float(beside @ beside)
+    return total / len(values)
 
 
 def _quantum(values: np.ndarray, samples: int, tiny: float) -> float:

@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     from hyrl_mj.tasks import Task
 
 TIMES = ("t", "time")
-COLUMNS = 500  # that are looked at, each of which takes some 10 ms
+COLUMNS = 200  # that are looked at, each of which takes some 20 ms
 SLOW = 0.5  # [s]: few robots are controlled so slowly
 LONGEST = 10  # samples of a robot, for which a row of a log may last
-MOST = 20_000_000  # samples with gaps between them, which take 160 MB a column and step
+MOST = 1_200_000  # samples with gaps between them, of which a column takes 150 bytes each
 
 
 @dataclass(frozen=True)

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
+import signal
+import threading
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import partial
+from multiprocessing.process import BaseProcess
 from typing import Any, Protocol, TypeVar
 
-from hyrl_mj.errors import BadInput
+from hyrl_mj.errors import BadInput, HyrlError
 from hyrl_mj.system import progress
 
 Job = TypeVar("Job")
@@ -62,15 +67,91 @@ def using_pool(pool: Pool) -> Iterator[None]:
         _pool.reset(token)
 
 
+class Processes:
+    """A `Pool` of new processes, one on each core, that begin with the first job and end with this one.
+
+    They import nothing from the current folder but what the user has named, and leave interrupts to this
+    process. It is a context manager.
+    """
+
+    def __init__(self) -> None:
+        self._pool: ProcessPoolExecutor | None = None
+        self._workers: set[BaseProcess] = set()
+
+    def map(self, work: Callable[[Any], Any], jobs: Iterable[Any], /) -> Iterable[Any]:
+        """Returns the results of the jobs, in their order."""
+        if self._pool is None:
+            with _apart():  # it starts a process that looks after semaphores
+                # A fork would copy the threads of torch and MuJoCo in whatever state they are.
+                spawn = multiprocessing.get_context("spawn")
+                self._pool = ProcessPoolExecutor(count(), spawn, initializer=_end_with_parent)
+        others = {*multiprocessing.active_children()}
+        with _apart():  # each job may start a process
+            results = self._pool.map(work, jobs)
+        self._workers |= {*multiprocessing.active_children()} - others
+        return results
+
+    def __enter__(self) -> Processes:
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        for worker in self._workers if kind else ():  # nobody waits for what they do
+            worker.terminate()
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def _apart() -> Iterator[None]:
+    """Processes that begin in the block do not search the current folder, and get no interrupts.
+
+    An interrupt of this process comes after the block.
+    """
+    usual = os.environ.get("PYTHONSAFEPATH")
+    os.environ["PYTHONSAFEPATH"] = "1"  # Python starts them as python -c
+    masks = hasattr(signal, "pthread_sigmask")  # not on Windows
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if masks else set()
+    try:
+        yield
+    finally:
+        os.environ.pop("PYTHONSAFEPATH")
+        if usual is not None:
+            os.environ["PYTHONSAFEPATH"] = usual
+        if masks:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _end_with_parent() -> None:
+    """Ends this process as soon as that which started it has ended, however that was."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def wait() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
 def has_pool() -> bool:
     """Returns whether there is a pool."""
     return _pool.get() is not None
 
 
 def in_processes(work: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[Result]:
-    """Yields the results of jobs in their order: from the pool if there is one, else one after the other."""
+    """Yields the results of jobs in their order: from the pool if there is one, else one after the other.
+
+    Raises:
+        HyrlError: a process of the pool was ended.
+    """
     pool = _pool.get()
-    yield from map(work, jobs) if pool is None else pool.map(partial(_alone, work), jobs)
+    try:
+        yield from map(work, jobs) if pool is None else pool.map(partial(_alone, work), jobs)
+    except BrokenExecutor:
+        raise HyrlError(
+            "a process that worked for this one was ended, as the system does where the memory is full: let "
+            "other programs end, and run it again to resume"
+        ) from None
 
 
 def _alone(work: Callable[[Job], Result], job: Job) -> Result:

@@ -45,7 +45,11 @@ def write_task(name: str, folder: Path) -> list[Path]:
     }
     if existing := [path for path in texts if path.exists() or path.is_symlink()]:
         raise BadInput(f"{existing[0]} exists already: choose another name, or another folder")
-    for path, text in texts.items():
-        with artifacts.replacing(path) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+    token = artifacts.before_writing.set(lambda path, temporary: True)
+    try:
+        for path, text in texts.items():
+            with artifacts.replacing(path) as temporary:
+                temporary.write_text(text, encoding="utf-8")
+    finally:
+        artifacts.before_writing.reset(token)
     return list(texts)

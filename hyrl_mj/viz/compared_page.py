@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from textwrap import fill as fill_text
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -41,7 +42,8 @@ def draw(compared: Compared) -> Figure:
                 )
             face = colours.PALE if filled else colours.WHITE
             panel.plot([], [], marker, color=colours.PALE, markerfacecolor=face, label=label)
-        panel.set_yticks(range(len(names)), [compared.of(name)[0].title for name in names])
+        titles = [fill_text(compared.of(name)[0].title, 40) for name in names]
+        panel.set_yticks(range(len(names)), titles)
         for tick, name in zip(panel.get_yticklabels(), names, strict=True):
             tick.set_fontweight("bold" if name == "hyrl" else "normal")
         panel.set(xlim=(-2, 102), ylim=(-0.6, len(names) - 0.4), xlabel="starts won [%]")

@@ -94,11 +94,12 @@ def tried_table(compared: Compared) -> Table | None:
 def sentences(compared: Compared) -> Iterator[str]:
     """Yields how HyRL compares with the best alternative, and which ones could not be compared."""
     others = [n for n in ranked(compared) if n not in ("hyrl", "policy")]
-    if others and compared.of("hyrl"):
-        best = others[0]
+    best = others[0] if others else "hyrl"
+    mean = compared.difference(best, "worst")
+    if others and np.isfinite(mean.value):
         title = compared.of(best)[0].title
         wins, hyrl = (f"{100 * _middle(compared, n, 'worst'):.2f}%" for n in (best, "hyrl"))
-        mean, between = compared.difference(best, "worst"), ""
+        between = ""
         if mean.interval is not None and np.ptp(mean.interval):
             low, high = (f"{100 * end:+.2f}" for end in mean.interval)
             between = f" (95% interval {low} to {high})"

@@ -292,8 +292,22 @@ def _pickle(draw: Random) -> bytes:
     return b"\x80\x04" + bodies[kind] + b"."
 
 
+def _log(memory: float, draw: Random, folder: Path) -> str:
+    """A log of many columns, of many gaps, or of many rows."""
+    columns, rows, gaps = draw.choice(((190, 60, 0.0), (1, 100_000, 0.5), (2, 200_000, 0.0)))
+    names = ",".join(f"c{i},c{i}_ref" for i in range(columns))
+    t, lines = 0.0, [f"t,{names}"]
+    for _ in range(rows):
+        t += 2.0 if draw.random() < gaps else 0.01
+        lines.append(f"{t:.2f}," + ",".join(f"{draw.random():.3f},0" for _ in range(columns)))
+    (folder / "log.csv").write_text("\n".join(lines), encoding="utf-8")
+    return resisted(command("noise", "log.csv"), folder, memory)
+
+
 def _field(material: Material, memory: float, draw: Random, folder: Path) -> str:
-    """A field at the limits of what a file may hold."""
+    """A field at the limits of what a file may hold; or a log."""
+    if draw.random() < 0.3:
+        return _log(memory, draw, folder)
     far = draw.choice((0.01, 1.0, 200.0, 999.0))
 
     def point() -> list[float]:

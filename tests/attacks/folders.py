@@ -36,6 +36,8 @@ MODULES = (
     "ogbench",
     "shimmy",
     "sitecustomize",
+    "multiprocessing",
+    "pickle",
 )
 # The command line in a new process.
 PROGRAM = "import sys; from hyrl_mj.cli import main; sys.argv[0] = 'hyrl-mj'; main()"
@@ -138,13 +140,15 @@ def threads(material: Material, memory: float, draw: Random, folder: Path) -> st
 
 
 def sweep(material: Material, memory: float, draw: Random, folder: Path) -> str:
-    """A received folder of a sweep, whose texts are formulas, links, escapes and elements."""
+    """A received folder of a sweep or a comparison: formulas, links, escapes, elements, much of each."""
     plant_modules(folder)
-    (folder / "sweep").mkdir()
     texts = (
         "=cmd|'calc'!A0", "@SUM(1)", "| a |", "<img src=x onerror=alert(1)>", ESCAPE, "evil.py",
         "[x](javascript:alert(1))", "env:{}", "../..", f"env:{json.dumps({'env': 'evil:X-v0'})}",
     )  # fmt: skip
+    if draw.random() < 0.5:
+        return _comparison(memory, draw, folder, texts)
+    (folder / "sweep").mkdir()
     setting(material.copy(folder / "sweep"), "task", draw.choice(texts))
     row: dict[str, Any] = {
         "setting": {"task": draw.choice(texts), "algorithm": draw.choice(texts), "eps": 0.1},
@@ -154,20 +158,61 @@ def sweep(material: Material, memory: float, draw: Random, folder: Path) -> str:
     common = {"preset": "fast", "horizon": None, "set": {}, "everywhere": False}
     write(folder / "sweep" / "sweep.json", {"common": common, "rows": [row]})
     broke = resisted(command("sweep", "--report", "sweep"), folder, memory)
-    return broke or _spoken(folder / "sweep")
+    return broke or _formulas(folder / "sweep") or _spoken(folder / "sweep" / "sweep.html")
 
 
-def _spoken(folder: Path) -> str:
-    """Returns which text in the tables of a sweep a program would take for more than a text."""
-    if not (folder / "sweep.html").exists():
+def _comparison(memory: float, draw: Random, folder: Path, texts: tuple[str, ...]) -> str:
+    """A received folder of a comparison, whose rows are done."""
+    (folder / "compare").mkdir()
+    numbers = (0.5, float("nan"), float("inf"), 1e300, int("9" * 400))
+
+    def row(name: str, **more: Any) -> dict[str, Any]:
+        figures = {"worst": 0.5, "won": 0.5, "late": 0.0}
+        usual = {
+            "title": name,
+            "seed": 0,
+            "state": "done",
+            "sentence": "",
+            "tried": {},
+            "samples": 1,
+        }
+        return {"name": name, **usual, "seconds": 1.0, "figures": figures} | more
+
+    other = row(draw.choice(texts), **draw.choice((
+        {"title": draw.choice((*texts, "$x^$", "a" * 100_000)), "sentence": draw.choice(texts)},
+        {"tried": dict.fromkeys(texts, 0.5), "sentence": "a" * 100_000},
+        {"figures": {"worst": draw.choice(numbers), draw.choice(texts): draw.choice(numbers)}},
+        {"samples": draw.choice(numbers), "seed": draw.choice(numbers)},
+        {"state": "unfit", "sentence": draw.choice(texts)},
+    )))  # fmt: skip
+    others = [other | {"name": f"{i}"} for i in range(draw.choice((1, 1, 1, 60, 5_000)))]
+    content = {
+        "task": "unit_circle", "eps": 0.1, "preset": "smoke", "lasting": True,
+        "set": draw.choice(({}, {}, {"a": [[] for _ in range(100_000)]})),
+        "rows": [row("policy"), row("hyrl"), *others],
+    }  # fmt: skip
+    write(folder / "compare" / "compare.json", content)
+    words = ("compare", "unit_circle", "--preset", "smoke", "--only", "policy", "--out", "compare")
+    broke = resisted(command(*words), folder, memory)
+    return broke or _spoken(folder / "compare" / "compare.html")
+
+
+def _formulas(folder: Path) -> str:
+    """Returns which cell of `sweep.csv` a spreadsheet would take for a formula."""
+    if not (folder / "sweep.csv").exists():
         return ""
     with (folder / "sweep.csv").open(encoding="utf-8", newline="") as file:
         for cell in chain(*csv.reader(file)):
             if cell.startswith(("=", "+", "-", "@")):
                 return f"sweep.csv has the formula {cell!r}"
-    page = (folder / "sweep.html").read_text(encoding="utf-8")
+    return ""
+
+
+def _spoken(file: Path) -> str:
+    """Returns which text in the tables of a page a program would take for more than a text."""
+    page = file.read_text(encoding="utf-8") if file.exists() else ""
     if "<img src=x" in page or re.search("(?i)(href|src)=.javascript:", page):
-        return "sweep.html holds an element of the stranger's"
+        return f"{file.name} holds an element of the stranger's"
     table = unescape(page.partition("<pre>")[2].partition("</pre>")[0])
     if re.search(r"(?<!\\)[<[]", table):
         return f"the table to paste as Markdown holds an element or a link: {table!r}"

@@ -17,6 +17,7 @@ KINDS = {
     "robustness.json": "robustness",
     "manifest.json": "manifest",
     "sweep.json": "sweep",
+    "compare.json": "comparison",
 }
 
 
