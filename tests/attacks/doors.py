@@ -98,7 +98,7 @@ def trials(material: Material, draw: Random, count: int) -> list[Trial]:
         "sweep": (folders.sweep, "run", 1, count),
         "path": (folders.path, "run", 1, count),
         "threads": (folders.threads, "run", 1, 2),
-        "user": (folders.user, "run", 1, count),
+        "other": (_other, "run", 1, count),
         "modules": (folders.modules, "environment", 1, 4),
     }
     turns = [kind for turn in range(5) for kind in kinds if kinds[kind][2] > turn]
@@ -304,10 +304,15 @@ def _log(memory: float, draw: Random, folder: Path) -> str:
     return resisted(command("noise", "log.csv"), folder, memory)
 
 
+def _other(material: Material, memory: float, draw: Random, folder: Path) -> str:
+    """A log, the folder of a comparison, or a run of another user."""
+    if draw.random() < 0.5:
+        return folders.user(material, memory, draw, folder)
+    return draw.choice((_log, folders.comparison))(memory, draw, folder)
+
+
 def _field(material: Material, memory: float, draw: Random, folder: Path) -> str:
-    """A field at the limits of what a file may hold; or a log."""
-    if draw.random() < 0.3:
-        return _log(memory, draw, folder)
+    """A field at the limits of what a file may hold."""
     far = draw.choice((0.01, 1.0, 200.0, 999.0))
 
     def point() -> list[float]:

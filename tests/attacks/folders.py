@@ -47,6 +47,11 @@ PATHS = (
     "a;touch executed", "%s%n", "{0}", "back\\slash", "#", "~", "a&b<c>", "*", "\u202egnp", "new\nline",
     "byte \udcff",
 )  # fmt: skip
+# What programs could take for more than a text.
+TEXTS = (
+    "=cmd|'calc'!A0", "@SUM(1)", "| a |", "<img src=x onerror=alert(1)>", ESCAPE, "evil.py",
+    "[x](javascript:alert(1))", "env:{}", "../..", f"env:{json.dumps({'env': 'evil:X-v0'})}",
+)  # fmt: skip
 
 
 def plant_modules(folder: Path) -> None:
@@ -140,20 +145,14 @@ def threads(material: Material, memory: float, draw: Random, folder: Path) -> st
 
 
 def sweep(material: Material, memory: float, draw: Random, folder: Path) -> str:
-    """A received folder of a sweep or a comparison: formulas, links, escapes, elements, much of each."""
+    """A received folder of a sweep, whose texts are formulas, links, escapes and elements."""
     plant_modules(folder)
-    texts = (
-        "=cmd|'calc'!A0", "@SUM(1)", "| a |", "<img src=x onerror=alert(1)>", ESCAPE, "evil.py",
-        "[x](javascript:alert(1))", "env:{}", "../..", f"env:{json.dumps({'env': 'evil:X-v0'})}",
-    )  # fmt: skip
-    if draw.random() < 0.5:
-        return _comparison(memory, draw, folder, texts)
     (folder / "sweep").mkdir()
-    setting(material.copy(folder / "sweep"), "task", draw.choice(texts))
+    setting(material.copy(folder / "sweep"), "task", draw.choice(TEXTS))
     row: dict[str, Any] = {
-        "setting": {"task": draw.choice(texts), "algorithm": draw.choice(texts), "eps": 0.1},
-        "seed": 0, "state": draw.choice(("done", "stopped")), "verdict": draw.choice(texts),
-        "sentence": draw.choice(texts), "seconds": 1.0, "figures": {draw.choice(texts): 1.0},
+        "setting": {"task": draw.choice(TEXTS), "algorithm": draw.choice(TEXTS), "eps": 0.1},
+        "seed": 0, "state": draw.choice(("done", "stopped")), "verdict": draw.choice(TEXTS),
+        "sentence": draw.choice(TEXTS), "seconds": 1.0, "figures": {draw.choice(TEXTS): 1.0},
     }  # fmt: skip
     common = {"preset": "fast", "horizon": None, "set": {}, "everywhere": False}
     write(folder / "sweep" / "sweep.json", {"common": common, "rows": [row]})
@@ -161,7 +160,7 @@ def sweep(material: Material, memory: float, draw: Random, folder: Path) -> str:
     return broke or _formulas(folder / "sweep") or _spoken(folder / "sweep" / "sweep.html")
 
 
-def _comparison(memory: float, draw: Random, folder: Path, texts: tuple[str, ...]) -> str:
+def comparison(memory: float, draw: Random, folder: Path) -> str:
     """A received folder of a comparison, whose rows are done."""
     (folder / "compare").mkdir()
     numbers = (0.5, float("nan"), float("inf"), 1e300, int("9" * 400))
@@ -178,12 +177,12 @@ def _comparison(memory: float, draw: Random, folder: Path, texts: tuple[str, ...
         }
         return {"name": name, **usual, "seconds": 1.0, "figures": figures} | more
 
-    other = row(draw.choice(texts), **draw.choice((
-        {"title": draw.choice((*texts, "$x^$", "a" * 100_000)), "sentence": draw.choice(texts)},
-        {"tried": dict.fromkeys(texts, 0.5), "sentence": "a" * 100_000},
-        {"figures": {"worst": draw.choice(numbers), draw.choice(texts): draw.choice(numbers)}},
+    other = row(draw.choice(TEXTS), **draw.choice((
+        {"title": draw.choice((*TEXTS, "$x^$", "a" * 100_000)), "sentence": draw.choice(TEXTS)},
+        {"tried": dict.fromkeys(TEXTS, 0.5), "sentence": "a" * 100_000},
+        {"figures": {"worst": draw.choice(numbers), draw.choice(TEXTS): draw.choice(numbers)}},
         {"samples": draw.choice(numbers), "seed": draw.choice(numbers)},
-        {"state": "unfit", "sentence": draw.choice(texts)},
+        {"state": "unfit", "sentence": draw.choice(TEXTS)},
     )))  # fmt: skip
     others = [other | {"name": f"{i}"} for i in range(draw.choice((1, 1, 1, 60, 5_000)))]
     content = {
