@@ -107,15 +107,20 @@ def test_an_unknown_stage_lists_the_known(run):
         run_stage(run, "simulat")
 
 
-def test_arcs_of_other_starts_go_and_the_user_s_own_stay(run):
+def test_arcs_that_no_stage_has_recorded_stay_and_are_not_those_of_the_run(run):
     folder, said = run.path / "arcs", []
-    before = contents(folder)
-    for name in ("start9_policy.npz", "critical_hyrl_q7.npz", "latest_policy.npz"):
+    before, own = (
+        contents(folder),
+        {"start9_policy.npz", "critical_hyrl_q7.npz", "latest_policy.npz"},
+    )
+    for name in own:
         shutil.copy(folder / "start0_policy.npz", folder / name)
-    run_stage(run, "simulate", say=said.append)
+    again = run_stage(run, "simulate", say=said.append)
     after = {path.name for path in folder.iterdir()}
-    assert after == {path.name for path in before} | {"latest_policy.npz"}
+    assert after == {path.name for path in before} | own
     assert said == [f"simulate: {len(before)} arcs; {said[0].partition('; ')[2]}"]
+    assert len(again.arcs()) == len(before)
+    assert not {("start9", "policy"), ("critical", "hyrl_q7")} & again.arcs().keys()
 
 
 def test_the_same_stage_gives_the_same_again(run):

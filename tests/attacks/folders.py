@@ -212,7 +212,7 @@ def _spoken(file: Path) -> str:
     page = file.read_text(encoding="utf-8") if file.exists() else ""
     if "<img src=x" in page or re.search("(?i)(href|src)=.javascript:", page):
         return f"{file.name} holds an element of the stranger's"
-    table = unescape(page.partition("<pre>")[2].partition("</pre>")[0])
+    table = unescape(page.partition("<pre><code>")[2].partition("</code></pre>")[0])
     if re.search(r"(?<!\\)[<[]", table):
         return f"the table to paste as Markdown holds an element or a link: {table!r}"
     columns = {len(re.findall(r"(?<!\\)\|", line)) for line in table.splitlines()}
