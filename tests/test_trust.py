@@ -248,3 +248,14 @@ def test_forged_results_are_refused(forge, examined, tmp_path):
     believe(path)
     with pytest.raises(BadArtifact, match=r"robustness.json: it"):
         hyrl_mj.load_run(path).robustness  # noqa: B018
+
+
+def test_what_is_written_again_pushes_no_other_record_out(tmp_path, monkeypatch):
+    monkeypatch.setattr(trust, "MOST", 2)
+    paths = [tmp_path / name for name in ("one", "other")]
+    for path in (paths[0], *3 * paths[1:]):
+        with trust.output(path), artifacts.replacing(path) as temporary:
+            temporary.write_text("the same each time")
+    for path in paths:
+        with trust.output(path):
+            pass  # it is known, or this raised an error

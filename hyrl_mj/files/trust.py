@@ -199,7 +199,9 @@ def _record(key: str, value: str) -> None:
         file.parent.mkdir(parents=True, exist_ok=True)
         with FileLock(file.with_suffix(".lock"), timeout=5):  # others record theirs
             records = _records()
-            new = [*_listed(key), value][-MOST:] if key in (TEXTS, WRITTEN) else value
+            # What is written again is the latest of its list, and pushes no other out.
+            others = [known for known in _listed(key) if known != value]
+            new = [*others, value][-MOST:] if key in (TEXTS, WRITTEN) else value
             if records.get(key) != new:
                 with replacing(file) as temporary:
                     text = json.dumps(records | {key: new}, indent=2)

@@ -161,7 +161,7 @@ def _copied(variables: Mapping[str, Any]) -> dict[str, Any]:
             if isinstance(value, kinds):
                 found[name] = copy.deepcopy(value)
             elif isinstance(value, chance):
-                found[name] = pickle.dumps(value)
+                found[name] = pickle.dumps(value)  # to compare it: nothing loads it
     return found
 
 
