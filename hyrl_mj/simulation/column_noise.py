@@ -304,7 +304,7 @@ def _delay(
     from scipy import stats
 
     def left(error: np.ndarray) -> float:
-        """Returns the mean square of an error (n,), NaN where it is not used."""
+        """Returns the mean square of an error (n,), infinite where there are too few of them."""
         error = error[fresh & np.isfinite(error)]
         if len(error) < LEAST:
             return np.inf
@@ -314,6 +314,7 @@ def _delay(
     lags = np.arange(-most // 10, most + 1)
     shifted = [_shifted(r, lag) for lag in lags.tolist()]
     squares = np.array([left(y - late) for late in shifted])
+    # With half the error at most: noise changes the sum of thousands of squares by some percent.
     if min(left(-y - late) for late in shifted) < squares.min() / 4:
         raise BadInput(
             f"{name} changes as {name}_ref does with the other sign: give --scale {name}=-1"

@@ -24,8 +24,8 @@ ROUNDING = 1e-12  # of positions
 # Runs side by side, and the samples after which those that do not hold their input draw a new one.
 RUNS, HELD = 512, 8
 STATES = 4_000  # at which it is looked for ends that are a success
-# How far from the places of least `miss` it is looked then, as shares of the chart: each time a half to a quarter
-# as far. An end that is smaller than the last may be missed.
+# How far from the places of least `miss` it is looked then, as shares of the chart: each time a half to a
+# quarter as far. An end that is smaller than the last may be missed.
 NEARER = (0.05, 0.02, 0.005, 0.002, 0.0005)
 # Moves come close to the largest one, and do not reach it: where it depends smoothly on the state, those of
 # thousands of samples fall short of it by less than this share.
