@@ -518,7 +518,7 @@ class Doubled:
 def doubled(monkeypatch):
     """Such a pool, after which this process uses its cores again."""
     monkeypatch.setattr(cores, "allowed", 0)
-    monkeypatch.setattr(progress, "enabled", progress.enabled)
+    monkeypatch.setattr(progress, "shown", progress.shown)
     return Doubled()
 
 

@@ -48,7 +48,7 @@ def dispatch(words: Sequence[str]) -> None:
 def main() -> None:
     """The console script `hyrl-mj`."""
     streams = Streams()
-    progress.enabled = streams.has_room_for_bars
+    progress.shown = "bars" if streams.has_room_for_bars else "lines"
     # Python would look for garbage among torch's modules for most of a second before it ends.
     atexit.register(gc.freeze)
 

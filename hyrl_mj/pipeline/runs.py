@@ -324,7 +324,10 @@ def examination_plan(run: Run) -> str:
     wanted = run.settings.lattice or LATTICE[run.task.chart.dimension]
     nodes = f"{' x '.join(map(str, grid.counts))} nodes"
     if max(grid.counts) < wanted:
-        nodes += f" (fewer than {wanted:,} on a side, which would not fit into the memory)"
+        nodes += (
+            f" (fewer than {wanted:,} on a side, so that they fit into the memory, and samples lead from node "
+            "to node)"
+        )
     if run.exact:
         return f"by the worst-case game on {nodes}"
     return f"by noisy episodes and an attack, and by the worst-case game on {nodes}: {run.why_estimate}"

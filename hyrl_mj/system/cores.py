@@ -157,9 +157,9 @@ def in_processes(work: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator
 def _alone(work: Callable[[Job], Result], job: Job) -> Result:
     """Does a job in a process of a pool: on one core, and without a bar of progress among those of others."""
     global allowed
-    before = allowed, progress.enabled
-    allowed, progress.enabled = 1, False
+    before = allowed, progress.shown
+    allowed, progress.shown = 1, ""
     try:
         return work(job)
     finally:
-        allowed, progress.enabled = before
+        allowed, progress.shown = before

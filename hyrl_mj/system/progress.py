@@ -1,14 +1,17 @@
-"""Progress bars on standard error, for everything that may take longer than a second."""
+"""Progress on standard error: bars for all that may take longer than a second; in a file, lines."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, Literal
 
 # Receives each line of text that a person may read while work goes on.
 Say = Callable[[str], None]
-# Set by the command line; as a library the package is silent.
-enabled = False
+# How progress is shown. Set by the command line; as a library the package is silent.
+shown: Literal["", "bars", "lines"] = ""
+# How often a line is written [s], where there is no terminal to draw a bar on.
+EVERY = 30.0
 
 
 def progress_bar(
@@ -20,7 +23,24 @@ def progress_bar(
     """
     from tqdm import tqdm  # slow to import
 
+    class Lines(tqdm):
+        """Writes a line where others draw a bar."""
+
+        def display(self, msg: str | None = None, pos: int | None = None) -> None:
+            if msg is None:
+                print(self, file=sys.stderr, flush=True)
+
+        def close(self) -> None:
+            self.disable = True
+
+    if shown == "lines":
+        known = total is not None or hasattr(work, "__len__")
+        return Lines(
+            work, label, total, unit=f" {unit}", unit_scale=True, delay=EVERY, mininterval=EVERY,
+            maxinterval=EVERY, disable=quiet,
+            bar_format="{desc}: {n_fmt}" + " of {total_fmt}" * known + "{unit} in {elapsed}",
+        )  # fmt: skip
     return tqdm(
         work, label, total, unit=f" {unit}", unit_scale=True, delay=0.5, leave=False,
-        dynamic_ncols=True, disable=quiet or not enabled,
+        dynamic_ncols=True, disable=quiet or not shown,
     )  # fmt: skip
