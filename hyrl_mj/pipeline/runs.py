@@ -325,8 +325,8 @@ def examination_plan(run: Run) -> str:
     nodes = f"{' x '.join(map(str, grid.counts))} nodes"
     if max(grid.counts) < wanted:
         nodes += (
-            f" (fewer than {wanted:,} on a side, so that they fit into the memory, and samples lead from node "
-            "to node)"
+            f" (fewer than {wanted:,} on a side, so that they fit into the memory, and samples lead from "
+            "node to node)"
         )
     if run.exact:
         return f"by the worst-case game on {nodes}"
