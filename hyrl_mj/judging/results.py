@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -10,7 +11,7 @@ import numpy as np
 
 from hyrl_mj.files import artifacts
 from hyrl_mj.policies import Policy, PolicyController
-from hyrl_mj.simulation import LoopSettings, closed_loop, simulate
+from hyrl_mj.simulation import LoopSettings, Rollout, closed_loop, simulate
 from hyrl_mj.tasks import Outcome, Task
 
 # Number of episodes from which arrivals are counted.
@@ -43,11 +44,10 @@ class Arrivals:
         starts = task.starts(EPISODES, np.random.default_rng(0))
         if type(task).verify is not Task.verify:  # an environment may not be what it seems
             simulate(task, policy, starts[:JUDGED])
-        settings = LoopSettings(vary=True, label="arrivals")
-        run = closed_loop(task, PolicyController(policy), starts, settings=settings)
+        run = _episodes(task, policy)
         arrived = run.outcome == Outcome.REACHED
         missed = arrived & ~task.arrived(run.path[-1])
-        return Arrivals(int(arrived.sum()), int(missed.sum()), len(starts))
+        return Arrivals(int(arrived.sum()), int(missed.sum()), len(arrived))
 
     def save(self, path: Path) -> None:
         """Writes `arrivals.json`."""
@@ -57,6 +57,27 @@ class Arrivals:
     def load(path: Path) -> Arrivals:
         """Reads what `save` wrote; raises `BadArtifact` if it is missing, damaged, or of another version."""
         return artifacts.read_record(path, "arrivals", Arrivals)
+
+
+def failures(task: Task, policy: Policy) -> tuple[Counter[Outcome], float | None]:
+    """Returns how the episodes of `Arrivals` end that do not arrive, and how near these come.
+
+    That is the least distance from the set-point on their way [scaled units], None of a task without one.
+    """
+    run = _episodes(task, policy)
+    failed = run.outcome != Outcome.REACHED
+    ends = Counter(Outcome(int(outcome)) for outcome in run.outcome[failed])
+    if task.set_point is None:
+        return ends, None
+    away = [task.chart.distance(z[failed], task.set_point).min(initial=np.inf) for z in run.path]
+    return ends, float(min(away))
+
+
+def _episodes(task: Task, policy: Policy) -> Rollout:
+    """Plays a policy from starts of the task, which are the same each time."""
+    starts = task.starts(EPISODES, np.random.default_rng(0))
+    settings = LoopSettings(vary=True, label="arrivals")
+    return closed_loop(task, PolicyController(policy), starts, settings=settings)
 
 
 # What the policy of a mode is.

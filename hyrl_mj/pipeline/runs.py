@@ -14,9 +14,9 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
-from hyrl_mj.errors import BadInput, check_seed, unknown
+from hyrl_mj.errors import BadInput, HyrlError, check_seed, unknown
 from hyrl_mj.files.manifest import locked
-from hyrl_mj.judging import Arrivals
+from hyrl_mj.judging import Arrivals, failures
 from hyrl_mj.judging.game import LATTICE
 from hyrl_mj.learning import Settings, Training, changed, preset
 from hyrl_mj.pipeline.steps import DIAGNOSIS, STAGES, extended_sets_stage, run_stage
@@ -48,6 +48,8 @@ class RunOptions:
         horizon: time T of the backward propagation [s], in the paper 0.5 (unit_circle) and 0.3 (vehicle);
             by default the paper's with preset paper, otherwise the sets are sized to the noise.
         all_coordinates: noise on every coordinate of the measurement, not only on the noisy ones of the task.
+        go_on: go on also where the policy of stage 1 arrives from less than half of its starts, so that the
+            other stages divide what it has not learned; preset smoke always goes on.
         set: settings to change, as they stand in config.json, such as stage1.samples=300000; by default none.
         out: the run directory; by default runs/TASK.
     """
@@ -59,6 +61,7 @@ class RunOptions:
     algorithm: str | None = None
     horizon: float | None = None
     all_coordinates: bool = False
+    go_on: bool = False
     set: dict[str, Any] = field(default_factory=dict)
     out: str | Path | None = None
 
@@ -153,6 +156,7 @@ def run(
 
     Raises:
         BadInput: a value that cannot be used.
+        HyrlError: stage 1 has not learned the task.
     """
     options = complete(RunOptions, options, changes)
     checked = usable_task(task)
@@ -160,7 +164,7 @@ def run(
     if options.algorithm is not None:
         algorithms.remember(options.algorithm)
     with opened(options.out or Path("runs") / checked.name, settings) as run:
-        return _run_all(run, say)
+        return _run_all(run, say, learned=not options.go_on and settings.preset != "smoke")
 
 
 def robustify(
@@ -227,8 +231,8 @@ def extend_again(run: Run, horizon: float, say: Say = print) -> Run:
     return load_run(run.path, run.function)
 
 
-def _run_all(run: Run, say: Say, stages: Collection[str] = STAGES) -> Run:
-    """Runs the stages that are not done."""
+def _run_all(run: Run, say: Say, stages: Collection[str] = STAGES, learned: bool = False) -> Run:
+    """Runs the stages that are not done; those after the first only if it has `learned`, if that is asked."""
     if not run.manifest.is_done("critical-set"):
         judge_task(run.task)
     if "robustness" in stages and not run.manifest.is_done("robustness"):
@@ -245,7 +249,25 @@ def _run_all(run: Run, say: Say, stages: Collection[str] = STAGES) -> Run:
             say(f"{stage}: done before")
         else:
             run = run_stage(run, stage, say)
+        if stage == "train" and learned:
+            _check_learned(run)
     return run
+
+
+def _check_learned(run: Run) -> None:
+    """Raises `HyrlError` if the policy of stage 1 arrives from less than half of the starts."""
+    task, settings, arrivals = run.task, run.settings.stage1, run.arrivals
+    if 2 * arrivals.arrived >= arrivals.episodes:
+        return
+    assert isinstance(settings, Training)
+    ends, nearest = failures(task, run.policy)
+    how = ", ".join(f"{count:,} {outcome.label}" for outcome, count in ends.most_common())
+    near = "" if nearest is None else f", and none comes nearer to the set-point than {nearest:.3g}"
+    raise HyrlError(
+        f"stage 1 has not learned {task.name}: its policy {arrivals} (the others: {how}{near}). See whether "
+        "the goal can be reached and whether the reward leads there; train longer with --set "
+        f"stage1.samples={2 * settings.samples} and another --out, or go on as it is with --go-on"
+    )
 
 
 def settings_of(task: Task, options: RunOptions) -> Settings:

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cache, partial
+from itertools import product
 from typing import ClassVar
 
 import numpy as np
 
 from hyrl_mj.errors import BadInput, counted
 from hyrl_mj.files.artifacts import Saved
-from hyrl_mj.judging.game import Limit, nearest_of
+from hyrl_mj.judging.game import Lattice, Limit, nearest_of
 from hyrl_mj.learning import OverlapSettings
 from hyrl_mj.policies import Policy
 from hyrl_mj.sets import Cloud, Grid, GridSet, check_points, distance_to
@@ -166,12 +167,13 @@ def extend(
     # The cells that backward runs visit are those of a grid.
     backward = task.kinematic and isinstance(grid, Grid) and stands_still(task)
     longest = round(settings.longest / task.dt)
+    held = None if ways is not None or Lattice.decides(task, grid) else held_inputs(task)
 
     @cache
     def told(i: int) -> np.ndarray:
         """Returns what runs from outside of a part tell: from where its way succeeds, and when they enter."""
         rim = None if backward else rims[i]
-        tell = partial(runs_from_outside, task, pis[i], partition, parts[i], rim, longest)
+        tell = partial(runs_from_outside, task, pis[i], partition, parts[i], rim, longest, held)
         return refined(task, grid, candidates[i] & ~parts[i].mask, points, radius, tell, 2)
 
     nowhere = np.zeros(grid.size, dtype=bool)
@@ -260,6 +262,7 @@ def runs_from_outside(
     part: GridSet,
     rim: np.ndarray | None,
     longest: int,
+    held: np.ndarray | None,
     rows: np.ndarray,
 ) -> np.ndarray:
     """Returns what is known of nodes `rows` (k,) by the runs of pi_i from those outside of M_i: (k, 3).
@@ -269,6 +272,10 @@ def runs_from_outside(
     obstacles, a run from outside M_i may go another way into it (see `Partition.astray`). Scattered nodes
     lie too far apart for a rim: there it counts wherever the runs enter M_i. Without a rim, only W_i is asked
     for.
+
+    pi_i says little of what a mode can do from where the stage-1 policy goes the other way. Where its run
+    fails, each of the `held` inputs (A, m) is held until the robot is in M_i, and pi_i goes on from there: a
+    run that arrives shows that a mode can.
     """
     arrives = partition.succeeds & part.mask
     entry = np.full(len(rows), np.inf)
@@ -284,7 +291,49 @@ def runs_from_outside(
             wins[outside] &= ~_astray(partition, part, arrives, rows[outside], rollout)
         if rim is not None:
             entry[outside] = _entries(part, rim, rollout, longest)
+    for u in () if held is None else held:
+        lost = outside[~wins[outside]]
+        if not len(lost):
+            break
+        starts = part.grid.nodes[rows[lost]]
+        rollout = policy_runs(
+            task, _Entering(pi, part, u), starts, label="extended sets, held inputs"
+        )
+        won = rollout.outcome == Outcome.REACHED
+        won &= ~_astray(partition, part, arrives, rows[lost], rollout)
+        wins[lost] = won
+        if rim is not None:
+            entry[lost[won]] = _entries(part, rim, rollout, longest)[won]
     return np.column_stack([wins, np.isfinite(entry), entry])
+
+
+@dataclass(frozen=True)
+class _Entering:
+    """Holds inputs u (m,) until the robot is in M_i, where pi_i goes on."""
+
+    pi: PartPolicy
+    part: GridSet
+    u: np.ndarray
+
+    def act(self, measured: np.ndarray) -> np.ndarray:
+        """Returns inputs (n, m) for measurements (n, p)."""
+        inside = self.part.contains(self.pi.task.z(measured))
+        u = np.tile(self.u, (len(measured), 1)).astype(float)
+        if inside.any():
+            u[inside] = self.pi.act(measured[inside])
+        return u
+
+
+def held_inputs(task: Task) -> np.ndarray | None:
+    """Returns the inputs (A, m) that show what a mode can do; None where samples take too long to try them.
+
+    They are the levels of a task, or the ends and the middle of the limits of each input.
+    """
+    if task.effort.attacked:
+        return None
+    if task.input_levels is not None:
+        return np.asarray(task.input_levels)
+    return np.array([*product(*np.linspace(*task.input_limits, 3).T)])
 
 
 def _astray(

@@ -46,7 +46,8 @@ def rooms(
 ) -> np.ndarray:
     """Returns the room (N, Q) of each mode around points (N, d) of M*, as a share of 2 eps; at most 1.
 
-    The room is the distance to either side along the noisy coordinates over which the mode wins.
+    The room is the distance to either side along the noisy coordinates over which the mode wins. It does not
+    end where no mode wins, as in a wall: there is nothing to switch to.
 
     Args:
         points: of M*.
@@ -56,11 +57,12 @@ def rooms(
     """
     shares = np.arange(0.0, 1.0 + 1e-9, STEP)
     room = np.ones((len(points), len(winning)))
+    nobody = ~np.any(winning, axis=0)
     directions = np.vstack([np.diag(2 * eps), -np.diag(2 * eps)])
     for direction in directions[directions.any(axis=1)]:
         line = grid.nearest((points[:, None] + shares[:, None] * direction).reshape(-1, len(eps)))
         for k, wins in enumerate(winning):
-            succeeds = wins[line].reshape(len(points), -1)
+            succeeds = (wins | nobody)[line].reshape(len(points), -1)
             first_loss = np.where(succeeds.all(axis=1), len(shares), succeeds.argmin(axis=1))
             room[:, k] = np.minimum(room[:, k], np.maximum(first_loss - 1, 0) * STEP)
     return room

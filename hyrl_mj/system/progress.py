@@ -26,6 +26,8 @@ def progress_bar(
     class Lines(tqdm):
         """Writes a line where others draw a bar."""
 
+        monitor_interval = 0  # no thread that draws what has not changed
+
         def display(self, msg: str | None = None, pos: int | None = None) -> None:
             if msg is None:
                 print(self, file=sys.stderr, flush=True)

@@ -48,10 +48,15 @@ class MyRobot(hyrl_mj.Task):
         return np.hstack([observation, np.zeros((len(observation), 1))])
 
     def clearance(self, measured):
-        """Distance of the puck from the pillar: (n,) [m]."""
-        centre = mjcf.geom_pos(self.model, "obstacle")[:2]
-        radii = mjcf.geom_size(self.model, "obstacle")[0] + mjcf.geom_size(self.model, "puck")[0]
-        return np.maximum(np.linalg.norm(measured[:, :2] - centre, axis=1) - radii, 0.0)
+        """Distance of the puck from the nearest pillar, a geom "obstacle...": (n,) [m]."""
+        away, puck = [], mjcf.geom_size(self.model, "puck")[0]
+        for name in mjcf.obstacles(self.model):
+            centre, radius = (
+                mjcf.geom_pos(self.model, name)[:2],
+                mjcf.geom_size(self.model, name)[0],
+            )
+            away.append(np.linalg.norm(measured[:, :2] - centre, axis=1) - (radius + puck))
+        return np.maximum(np.min(away, axis=0), 0.0)
 
     def reward(self, measured, u):
         """The reward of a step with inputs u (n, m) that led to these measurements."""
