@@ -110,7 +110,7 @@ class ModeGround(ABC):
         within: M_ext_i, widened by it.
         wanted: (N,) bool, the nodes of the set's grid that are such states.
         nodes: (n,) the indices of these nodes.
-        early: (k,) those of them where an episode may start; all if there are none.
+        early: (k,) those of them where an episode may start; where none may, those where modes meet, or all.
         enough: score with which a training may end.
         nearly: score with which no training is expected to do better; none by default.
         settled: share of a training after which scores count.
@@ -146,10 +146,23 @@ class ModeGround(ABC):
         # Where the stage-1 policy never succeeds, training may still find a way.
         self.wanted = possible if table or not wins.any() else wins
         self.nodes = np.flatnonzero(self.wanted)
-        early = self.nodes[task.may_start(self.grid.nodes[self.nodes])]
-        self.early = early if len(early) else self.nodes
+        self.early = self._early()
         self._latest: tuple[Policy, Judged] | None = None
         self._prepare(policy)
+
+    def _early(self) -> np.ndarray:
+        """Returns the nodes (k,) where episodes begin: starts of the task, or where modes meet, or all."""
+        nodes, z = self.nodes, self.grid.nodes[self.nodes]
+        if (starts := self.task.may_start(z)).any():
+            return nodes[starts]
+        near = self._meets(nodes)
+        return near if len(near) else nodes
+
+    def _meets(self, nodes: np.ndarray) -> np.ndarray:
+        """Returns those of some nodes (k,) that noise can show where modes meet."""
+        chart = self.task.chart
+        off = distance_to(chart, self.extended.points, self.grid.nodes[nodes])
+        return nodes[off <= 2 * float(np.linalg.norm(self.bound / chart.scale))]
 
     @abstractmethod
     def _prepare(self, policy: Policy | None) -> None:
@@ -331,18 +344,13 @@ class Episodes(ModeGround):
         self._plants = {n: task.plant(n) for n in set(sizes)}
 
     def play(self, policy: Policy, batch: int, kind: str) -> tuple[np.ndarray, np.ndarray]:
-        """Returns which episodes of a batch are won (k,), and how far off they end (k,).
-
-        Without noise they have to end at the set-point, under noise they have to survive.
-        """
+        """Returns which episodes of a batch are won (k,), as the task says, and how far off they end (k,)."""
         rows, task = self.batches[batch], self.task
         settings = LoopSettings(plant=self._plants[len(rows)], vary=True, quiet=True)
         noise, controller = Noise(kind, self.noise.bound), PolicyController(policy)
         starts, seed = self.begins[rows], int(rows[0])
         run = closed_loop(task, controller, starts, noise, seed=seed, settings=settings)
-        ends, won = run.path[-1], run.outcome == Outcome.REACHED
-        won = won & task.arrived(ends) if kind == game.NO_NOISE else won
-        return won, task.miss(ends)
+        return run.outcome == Outcome.REACHED, task.miss(run.path[-1])
 
     def share(self, policy: Policy, plays: Sequence[Play]) -> float:
         """Returns the share of the episodes of plays that a policy wins."""
@@ -461,9 +469,7 @@ class ByAttack(ByEpisodes):
         Half of them lie where modes meet, where a mode may have to go against its neighbours. A robot with
         speed of its own could not begin at rest everywhere there.
         """
-        chart, nodes = self.task.chart, self.nodes
-        off = distance_to(chart, self.extended.points, self.grid.nodes[nodes])
-        near = nodes[off <= 2 * float(np.linalg.norm(self.bound / chart.scale))]
+        near = self._meets(self.nodes)
         half = ATTACKED // 2 if len(near) else 0
         if not half:
             return super()._attacked()
