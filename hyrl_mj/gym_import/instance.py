@@ -596,14 +596,14 @@ class Instance:
 
     def wander(self, rng: np.random.Generator, samples: int, held: int) -> Iterator[Any]:
         """Yields what each step returns under inputs at random, each held for so many samples, to the end."""
-        for k in range(samples):
-            if k % held == 0:
-                u = self.drawn(rng)
-            with self.undrawn():
+        with self.undrawn():
+            for k in range(samples):
+                if k % held == 0:
+                    u = self.drawn(rng)
                 result = self.stepped(u)
-            yield result
-            if result[2] or result[3]:
-                return
+                yield result
+                if result[2] or result[3]:
+                    break
 
     @contextmanager
     def undrawn(self) -> Iterator[None]:

@@ -16,6 +16,7 @@ from hyrl_mj.gym_import.plant import EnvironmentPlant, check_finite
 from hyrl_mj.gym_import.pool import Pool
 from hyrl_mj.gym_import.specification import MOVED, Derived, EnvironmentSpec
 from hyrl_mj.gym_import.stage import Played
+from hyrl_mj.system.generators import kept_generators
 
 # Episodes and samples of a trial, and for how many samples inputs are held.
 EPISODES, SAMPLES, HELD = 8, 40, 8
@@ -31,7 +32,8 @@ def observer_of(instance: Instance) -> str:
 
     def agreeing(names: dict[str, Any]) -> dict[str, Any]:
         seen = flat(instance.inner_seen, space)
-        return {name: get for name, get in names.items() if _agrees(get, seen, space)}
+        with kept_generators():  # one that is no observer may draw
+            return {name: get for name, get in names.items() if _agrees(get, seen, space)}
 
     for seed in range(EPISODES):
         instance.reset(seed)
