@@ -31,10 +31,6 @@ def signal(vehicle):
     return samples
 
 
-def test_no_noise_is_zero(signal):
-    np.testing.assert_array_equal(signal(Noise()), 0.0)
-
-
 def test_uniform_noise_fills_its_bounds_and_no_more(signal):
     values = signal(Noise("uniform", 0.1))
     assert values.shape == (20, 1000, 2)
@@ -44,54 +40,37 @@ def test_uniform_noise_fills_its_bounds_and_no_more(signal):
     assert values.std() == pytest.approx(0.1 / np.sqrt(3), rel=0.02)
 
 
-def test_alternating_noise_starts_positive_and_changes_sign_at_every_sample(signal):
-    values = signal(Noise("alternating", 0.1))
-    np.testing.assert_array_equal(values[::2], 0.1)
-    np.testing.assert_array_equal(values[1::2], -0.1)
-
-
 def test_alternating_noise_goes_by_the_sample_of_each_simulation(circle):
     values = draw(Noise("alternating", 0.3).against(circle, None), np.array([0, 1, 2, 7]), 1)
     np.testing.assert_array_equal(values[:, 0], [0.3, -0.3, 0.3, -0.3])
 
 
-@pytest.mark.parametrize("kind", ["uniform", "alternating"])
-def test_the_seed_fixes_the_signal(kind, signal):
-    noise = Noise(kind, 0.2)
-    np.testing.assert_array_equal(signal(noise, 7), signal(noise, 7))
-
-
-def test_another_seed_gives_another_signal(signal):
+def test_the_seed_decides_the_signal(signal):
     noise = Noise("uniform", 0.2)
+    np.testing.assert_array_equal(signal(noise, 7), signal(noise, 7))
     assert (signal(noise, 7) != signal(noise, 8)).mean() > 0.99
+    np.testing.assert_array_equal(signal(Noise("uniform", 0)), 0.0)
 
 
-@pytest.mark.parametrize("bound", [0, 0.0, 1, 0.25, np.float64(0.25)])
-def test_bounds_that_can_be_used(bound, signal):
-    assert np.abs(signal(Noise("uniform", bound))).max() <= bound
-
-
-@pytest.mark.parametrize("bound", [-0.1, float("nan"), float("inf"), "0.1", None])
+@pytest.mark.parametrize("bound", [-0.1, float("nan"), "0.1"])
 def test_bad_bounds_are_named(bound):
     with pytest.raises(BadInput, match="finite number >= 0") as caught:
         Noise("uniform", bound)
     assert repr(bound) in str(caught.value)
 
 
-def test_an_unknown_kind_lists_the_known():
-    with pytest.raises(BadInput, match=r"'pink'.*none, uniform, alternating"):
-        Noise("pink", 0.1)
-
-
-@pytest.mark.parametrize("kind", ["worst", "attack"])
-def test_noise_that_has_to_be_found_says_so(kind):
-    with pytest.raises(BadInput, match=f"found first.*--noise {kind}"):
+@pytest.mark.parametrize(
+    ("kind", "says"),
+    [
+        ("worst", "found first.*--noise worst"),
+        ("attack", "found first.*--noise attack"),
+        ("pink", "'pink'.*none, uniform, alternating"),
+        ("alternate", r"Did you mean 'alternating'\?"),
+    ],
+)
+def test_what_is_no_kind_is_told(kind, says):
+    with pytest.raises(BadInput, match=says):
         Noise(kind, 0.1)
-
-
-def test_a_misspelt_kind_gets_a_hint():
-    with pytest.raises(BadInput, match=r"Did you mean 'alternating'\?"):
-        Noise("alternate", 0.1)
 
 
 # ---- signals that are given, and noise that looks at the loop
@@ -162,7 +141,6 @@ def jumping(self, now):
             lambda self, now: np.full(len(now.rows), 0.1),
             r"float64 of shape \(60,\), where \(60, 2\)",
         ),
-        (lambda self, now: 0.0, r"of shape \(\)"),
         (lambda self, now: None, r"object of shape \(\)"),
         (lambda self, now: np.zeros(now.measurement.shape, int), "gives int64 of shape"),
         (lambda self, now: now.measurement * np.nan, "noise is nan at sample 0 of simulation 0"),
@@ -231,10 +209,9 @@ def test_what_is_no_noise_gets_an_example(vehicle, noise):
         gym.make(vehicle.env_id, noise=noise)
 
 
-@pytest.mark.parametrize("bound", [1.5, 100.0])
-def test_noise_that_hides_the_whole_chart_is_refused(vehicle, bound):
+def test_noise_that_hides_the_whole_chart_is_refused(vehicle):
     with pytest.raises(BadInput, match=r"hides the whole state space of vehicle: .* below 1\.5 m"):
-        vehicle.check_noise(bound)
+        vehicle.check_noise(1.5)
     assert vehicle.check_noise(1.4) == 1.4
 
 
@@ -249,7 +226,7 @@ def test_adversarial_noise_leads_to_the_greater_danger(vehicle):
 
 
 def test_adversarial_noise_keeps_to_its_bound_and_columns(vehicle):
-    z0 = np.random.default_rng(0).uniform([0, -1], [0.5, 1], (50, 2))
+    z0 = np.random.default_rng(0).uniform([0, -1], [0.5, 1], (20, 2))
     # A side that depends on both coordinates.
     loop = PolicyController(sign_policy(vehicle, line=lambda x: x - 0.25))
     for everywhere in (False, True):

@@ -74,9 +74,9 @@ def test_loops_do_not_share_its_memory(vehicle, drift):
 def test_it_works_in_noisy_episodes(vehicle):
     loops = {"ideal": ideal_controller(vehicle, 0.154, clear=1.004)}
     noises = (Noise("climb", 0.1), Noise("uniform", 0.1))
-    records = noisy_episodes(vehicle, Regions(decisions(vehicle).points), loops, noises, 200).counts
+    records = noisy_episodes(vehicle, Regions(decisions(vehicle).points), loops, noises, 10).counts
     assert {r.noise for r in records} == {"climb", "uniform"}
-    assert sum(r.episodes for r in records if r.noise == "climb") == 200
+    assert sum(r.episodes for r in records if r.noise == "climb") == 10
 
 
 def test_episodes_that_reset_at_different_times_restart_their_rows(vehicle):

