@@ -196,9 +196,15 @@ def test_seconds_only_decide_how_many_rounds_are_done(vehicle):
 
 
 def test_the_seed_decides_what_is_tried(vehicle):
-    one, two = (on(vehicle, Lock(), ON_THE_LEFT[:1], rounds=5, seed=seed) for seed in (0, 1))
-    signals = [np.concatenate([arc.measured for arc in found.arcs]) for found in (one, two)]
-    assert signals[0].shape != signals[1].shape or not np.array_equal(*signals, equal_nan=True)
+    tried = []
+    for seed in (0, 0, 1):
+        search = Search(vehicle, Lock(), ON_THE_LEFT, EPS, np.array([0.0, 1.0]), seed=seed)
+        search.prepare(search.length)
+        search._try = lambda rows, programmes: tried.append(programmes)
+        held = math.ceil(len(search.rules.common) / search.settings.population)
+        search.round(held + 1)  # the first that draws
+    np.testing.assert_array_equal(tried[0], tried[1])
+    assert not np.array_equal(tried[0], tried[2])
 
 
 def test_no_round_is_done_once_all_is_lost(vehicle):
@@ -207,15 +213,11 @@ def test_no_round_is_done_once_all_is_lost(vehicle):
 
 
 def test_no_round_follows_one_by_which_enough_is_lost(vehicle):
-    usual = on(vehicle, Lock(), ON_THE_LEFT, rounds=16)
-    assert usual.count.lost > 1
-    assert usual.count.rounds > 1
-    loop, some = {"it": Lock()}, Budget(rounds=16, enough=1)
-    found = attack(vehicle, loop, ON_THE_LEFT, EPS, some)["it"]
-    assert found.count.lost >= 1
-    before = on(vehicle, Lock(), ON_THE_LEFT, rounds=found.count.rounds - 1)
-    assert found.count.rounds < usual.count.rounds
-    assert before.count.lost == 0
+    loop, starts = PolicyController(sign_policy(vehicle)), np.array([[0.3, 0.0], [0.0, 0.9]])
+    for enough, rounds in ((None, 3), (1, 1)):
+        budget = Budget(rounds=3, enough=enough)
+        count = attack(vehicle, {"it": loop}, starts, EPS, budget)["it"].count
+        assert (count.lost, count.rounds) == (1, rounds)
 
 
 @pytest.mark.parametrize(

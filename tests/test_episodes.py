@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from planted import decisions, halves, ideal_controller, one_way_policy, sign_policy
 
-from hyrl_mj import BadInput, LoopSettings, Noise, closed_loop
+from hyrl_mj import BadInput, Noise
 from hyrl_mj.judging import episodes as bulk
 from hyrl_mj.judging.episodes import Regions, noisy_episodes
 from hyrl_mj.judging.game import Ends, compare
@@ -59,11 +59,8 @@ def test_the_counts_add_up(records):
                 assert sum(r.outcomes.values()) == r.episodes
                 assert r.reached == r.outcomes.get("reached", 0) / r.episodes
                 assert 0 <= r.interval[0] <= r.reached <= r.interval[1] <= 1
-
-
-def test_the_regions_hold_the_same_starts_for_all(records):
     for region in ("near M*", "elsewhere", "not winnable"):
-        assert len({r.episodes for r in records if r.region == region}) == 1
+        assert len({r.episodes for r in records if r.region == region}) == 1, "the same starts"
 
 
 def test_starts_near_the_critical_set_are_those_within_twice_the_noise(vehicle):
@@ -118,7 +115,7 @@ def test_the_same_seed_gives_the_same_counts(vehicle, on_vehicle):
 
 
 def test_batches_add_up_and_none_is_the_same(vehicle, on_vehicle, monkeypatch):
-    monkeypatch.setattr(bulk, "BATCH", 40)
+    monkeypatch.setattr(bulk, "BATCH", 50)
     sign, noises = {"sign": on_vehicle[1]["sign"]}, (Noise("uniform", 0.1),)
 
     def near(count):
@@ -127,7 +124,7 @@ def test_batches_add_up_and_none_is_the_same(vehicle, on_vehicle, monkeypatch):
         assert sum(r.episodes for r in records) == count
         return record(records, "sign", "near M*").episodes
 
-    one, two, more = (near(count) for count in (40, 80, 100))
+    one, two, more = (near(count) for count in (50, 100, 125))
     assert one < two < more
     assert two != 2 * one
 
@@ -144,19 +141,6 @@ def test_episodes_that_make_no_sense_are_refused(vehicle, on_vehicle, noise, cou
     sign = {"sign": on_vehicle[1]["sign"]}
     with pytest.raises(BadInput, match=message):
         noisy_episodes(vehicle, Regions(decisions(vehicle).points), sign, (noise,), count)
-
-
-@pytest.mark.parametrize("kind", ["uniform", "alternating", "adversarial"])
-def test_noise_everywhere_acts_on_every_column(vehicle, kind):
-    # A line at which the way is decided that runs askew, so that both columns matter.
-    loop = PolicyController(sign_policy(vehicle, lambda x: x - 0.3))
-    z0 = vehicle.starts(300, np.random.default_rng(0))
-    for everywhere, columns in ((False, [False, True]), (True, [True, True])):
-        noise = Noise(kind, 0.1, everywhere)
-        rollout = closed_loop(vehicle, loop, z0, noise, settings=LoopSettings(steps=1, record=True))
-        n = rollout.measured[0] - rollout.path[0]
-        assert np.abs(n).max() <= 0.1 + 1e-12
-        assert (np.abs(n).max(axis=0) > 0.05).tolist() == columns
 
 
 def test_controllers_are_compared_from_starts_that_all_win_without_noise(vehicle, on_vehicle):

@@ -205,7 +205,7 @@ def test_the_guard_keeps_robots_off_posts_whatever_the_noise(field):
     rng, noise = np.random.default_rng(0), 0.1
     posts = [(-2.0, 0.0, 0.5), (0.0, 1.7, 0.9), (0.3, -1.4, 0.3), (-3.0, 2.0, 0.4)]
     controller = straight(field, posts, noise)
-    task, n = controller.task, 80
+    task, n = controller.task, 50
     z = np.column_stack([rng.uniform(-4, 2, (4 * n, 2)), rng.uniform(-np.pi, np.pi, 4 * n)])
     places = np.array(posts)
     room = np.linalg.norm(z[:, None, :2] - places[:, :2], axis=2) - places[:, 2]

@@ -440,16 +440,6 @@ def test_no_noise_makes_a_won_start_of_the_circle_late(circle, on_circle, name, 
         np.testing.assert_array_equal(arrivals(circle, arcs), value[at])
 
 
-def test_modes_started_by_hand_arrive_when_the_game_says(circle, on_circle):
-    game, controllers = on_circle
-    eps = 12 * game.lattice.grid.cell
-    value = game.value("hysteresis", eps)[0, :-2]
-    at, z0 = some(game.lattice.grid.nodes, value > 40, 60)
-    noise = game.worst_noise("hysteresis", eps)
-    arcs = simulate(circle, controllers["hysteresis"], z0, noise=noise, q0=0)
-    np.testing.assert_array_equal(arrivals(circle, arcs), value[at])
-
-
 # ---- the limit: the ways
 
 

@@ -226,7 +226,7 @@ def test_adversarial_noise_leads_to_the_greater_danger(vehicle):
 
 
 def test_adversarial_noise_keeps_to_its_bound_and_columns(vehicle):
-    z0 = np.random.default_rng(0).uniform([0, -1], [0.5, 1], (20, 2))
+    z0 = np.random.default_rng(0).uniform([0, -1], [0.5, 1], (50, 2))
     # A side that depends on both coordinates.
     loop = PolicyController(sign_policy(vehicle, line=lambda x: x - 0.25))
     for everywhere in (False, True):

@@ -1,19 +1,14 @@
 """A new kind of noise is one class: defined here, it works wherever noise does, memory and all."""
 
-import sys
-from dataclasses import replace
-from types import SimpleNamespace
-
 import gymnasium as gym
 import numpy as np
 import pytest
 from planted import decisions, ideal_controller, sign_policy
 
-from hyrl_mj import BadInput, HybridArc, Noise, Run, Signal, cli, register_noise, simulate
-from hyrl_mj.cli import commands, parsing
+from hyrl_mj import BadInput, Noise, Signal, register_noise, simulate
 from hyrl_mj.gym_export.core import BatchedEnv
 from hyrl_mj.judging.episodes import Regions, noisy_episodes
-from hyrl_mj.policies.controllers import PolicyController
+from hyrl_mj.simulation import noise_of
 from hyrl_mj.simulation.noise import _KINDS
 
 PACE = 0.1
@@ -121,43 +116,10 @@ def test_it_works_in_gymnasium(vehicle):
     assert max(ages) > 2, "episodes began at different times"
 
 
-@pytest.fixture
-def command_line(vehicle, monkeypatch, tmp_path):
-    """Calls hyrl-mj with a run of planted controllers; returns the exit status."""
-    loops = {
-        "policy": PolicyController(sign_policy(vehicle)),
-        "hyrl": ideal_controller(vehicle, 0.154, clear=1.004),
-    }
-    run = SimpleNamespace(
-        task=vehicle,
-        controllers=loops,
-        latest_path=lambda name: tmp_path / f"{name}.npz",
-        path=tmp_path,
-    )
-    opened = replace(parsing.KINDS[Run], read=lambda path: run)
-    monkeypatch.setitem(parsing.KINDS, Run, opened)
-    monkeypatch.setattr(parsing, "load_run", lambda run, task=None: run)
-    monkeypatch.setattr(commands.pipeline, "as_stage", lambda run, name, work: work(run))
-
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["hyrl-mj", *arguments])
-        try:
-            cli.main()
-        except SystemExit as end:
-            return end.code
-        return 0
-
-    return call
-
-
-def test_its_name_works_on_the_command_line(command_line, tmp_path, capsys):
-    start = ("simulate", "run", "--start", "0", "0.5", "--eps", "0.1", "--noise")
-    assert command_line(*start, "climb") in (0, None)
-    assert "hyrl    reached" in capsys.readouterr().out
-    arc = HybridArc.load(tmp_path / "hyrl.npz")
-    np.testing.assert_allclose((arc.measured - arc.z)[[0, 5, 15], 1], drifted([0, 5, 15]))
-    assert command_line(*start, "drifting") == 2
-    assert "Did you mean 'drift'?" in capsys.readouterr().err
+def test_its_name_works_where_noise_is_named(vehicle):
+    assert noise_of(vehicle, "climb", 0.1) == Noise("climb", 0.1)
+    with pytest.raises(BadInput, match="Did you mean 'drift'"):
+        noise_of(vehicle, "drifting", 0.1)
 
 
 def test_a_kind_is_registered_once(drift):

@@ -8,7 +8,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from environments import Puck
-from hypothesis import given, settings, strategies as st
 from manual import ROOT
 
 import hyrl_mj
@@ -132,32 +131,22 @@ def test_a_turn_is_no_jump():
     assert np.abs(played("delay 1", task=CIRCLE, steps=150)[0]).max() <= 0.05 + 1e-9
 
 
-parts = st.fixed_dictionaries(
-    {},
-    optional={
-        "uniform": st.floats(0.001, 0.1),
-        "bias": st.floats(0.001, 0.1),
-        "drift": st.floats(0.001, 0.1),
-        "gaussian": st.floats(0.001, 0.1),
-        "delay": st.integers(1, 4),
-        "hold": st.integers(1, 3),
-        "quantum": st.floats(0.001, 0.05),
-    },
-).filter(len)
-
-
-@pytest.mark.long
-@settings(max_examples=25, deadline=None)
-@given(parts, st.sampled_from([VEHICLE, CIRCLE, "gate"]), st.integers(0, 1000))
-def test_all_parts_together_stay_within_the_bound(numbers, name, seed):
-    text = " + ".join(f"{word} {value:.6g}" for word, value in numbers.items())
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("uniform 0.05 + bias 0.02 + drift 0.03 + delay 2 + hold 2 + quantum 0.01", VEHICLE),
+        ("gaussian 0.1 + delay 0-3 + quantum 0.05", CIRCLE),
+        ("bias 0.1 + drift 0.05 rate 0.2 + hold 3 rate 0.7", "gate"),
+    ],
+)
+def test_all_parts_together_stay_within_the_bound(text, name):
     sensor, task = Sensor.parse(text), hyrl_mj.get_task(name)
     assert str(Sensor.parse(str(sensor))) == str(sensor)
-    noise, _ = played(text, task=name, seed=seed, n=20)
+    noise, _ = played(text, task=name, seed=5, n=20)
     d = task.chart.dimension
     bound, shares = sensor.on(task)
     assert (np.nanmax(np.abs(noise), axis=(0, 1))[:d] <= bound * np.array(shares[:d]) + 1e-9).all()
-    again, _ = played(text, task=name, seed=seed, n=20)
+    again, _ = played(text, task=name, seed=5, n=20)
     np.testing.assert_array_equal(noise, again)
 
 
@@ -435,9 +424,7 @@ def test_a_robot_declares_its_sensors_once(tmp_path):
         assert settings_of(task, RunOptions(**options)).eps == noise
 
 
-@pytest.mark.parametrize(
-    "options", [{"eps": 0.1}, {"all_coordinates": True}], ids=["a bound", "all coordinates"]
-)
+@pytest.mark.parametrize("options", [{"eps": 0.1}, {"all_coordinates": True}])
 def test_a_sensor_tells_its_own_bounds(options, tmp_path):
     with pytest.raises(BadInput, match="leave eps and all_coordinates out"):
         hyrl_mj.run(VEHICLE, noise="bias 0.1", out=tmp_path / "run", **options)
