@@ -365,7 +365,7 @@ def test_noise_acts_on_the_noisy_columns_only(jumping_arc):
         ({"horizon": np.inf}, "horizon inf s .*time > 0"),
         ({"z0": [0.0, 2.0]}, r"y = 2 m\) is outside vehicle"),
         ({"z0": np.zeros(3)}, "vehicle is 2 number"),
-        ({"z0": np.zeros((0, 2))}, "start"),
+        ({"z0": np.zeros((0, 2))}, r"got shape \(0, 2\)"),
         ({"q0": 2}, r"mode 2 is unknown: choose one of \(0, 1\)"),
         ({"q0": 0.5}, r"mode 0.5 is unknown: choose one of \(0, 1\)"),
         ({"z0": np.zeros((3, 2)), "q0": np.array([0, 1])}, r"\(2,\)"),
