@@ -617,3 +617,22 @@ def test_the_post_in_focus_has_the_colour_of_its_side(command, written, tmp_path
     assert left[0] > 0.005 > 0.001 > left[1]
     assert right[1] > 0.005 > 0.001 > right[0]
     assert sorted(p.name for p in tmp_path.iterdir()) == ["field.json", "x.png"]
+
+
+@pytest.mark.long
+@needs_gl
+def test_a_start_at_the_goal_and_moving_posts_are_rendered(command, written, tmp_path):
+    moving = {"radius_m": 0.5, "positions_m": [[-3, 0], [-3, 1]]}
+    content = {
+        **ONE,
+        "posts": [moving],
+        "interval_s": 4,
+        "time_s": 7,
+        "starts": [start(0, 0), START],
+    }
+    words = ["--out", tmp_path / "x.gif", "--size", "480x240", "--fps", "2", "--camera", "chase"]
+    status, _, errors = command("--field", written(content), *words, "--shown", "0-1")
+    assert (status, errors) == (0, "")
+    with Image.open(tmp_path / "x.gif") as image:
+        assert image.size == (480, 240)
+        assert image.n_frames > 10

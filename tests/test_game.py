@@ -253,17 +253,12 @@ def test_hysteresis_loses_from_the_wrong_start_mode_where_noise_hides_it(on_vehi
     )
 
 
-def test_every_start_of_the_vehicle_is_won_or_lost(on_vehicle):
-    # x = 3 m comes some day, and with it the end.
+def test_every_start_is_won_or_lost_and_no_more_are_won_under_more_noise(on_vehicle):
     game, controllers = on_vehicle
     for name in controllers:
+        # x = 3 m comes some day, and with it the end.
         assert not (game.value(name, 0.1) == NEVER)[:, np.append(game.starts, [True] * 2)].any()
         assert not lasting(game.moves(name, 0.1)).any()
-
-
-def test_it_wins_no_more_under_more_noise(on_vehicle):
-    game, controllers = on_vehicle
-    for name in controllers:
         values = [game.value(name, eps) for eps in (0.0, 0.05, 0.1, 0.2)]
         for less, more in pairwise(values):
             assert (less <= more).all()

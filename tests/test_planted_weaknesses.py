@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import cycle
 
 import numpy as np
 import pytest
@@ -107,9 +108,7 @@ def default(**options):
     return Budget(rounds=Effort().attack_rounds, **options)
 
 
-@pytest.mark.first(7)
-@pytest.mark.parametrize("make", ["one mode", "several modes"])
-@pytest.mark.parametrize("name", SIGNALS)
+@pytest.mark.parametrize(("name", "make"), zip(SIGNALS, cycle(["one mode", "several modes"])))
 def test_what_one_signal_breaks_is_broken(vehicle, name, make):
     signal, everywhere = SIGNALS[name], name == "the second column alone"
     start = STARTS[:1]

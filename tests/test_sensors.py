@@ -2,12 +2,11 @@
 
 import shutil
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from environments import Puck
 from manual import ROOT
 
 import hyrl_mj
@@ -180,7 +179,7 @@ def test_what_is_no_sensor_is_refused(text):
         Sensor.parse(text)
 
 
-def test_what_cannot_be_sensed_is_refused(few_trials):
+def test_what_cannot_be_sensed_is_refused():
     vehicle = hyrl_mj.get_task(VEHICLE)
     with pytest.raises(BadInput, match="60: give fewer"):
         Sensor.parse("delay 60").on(vehicle)
@@ -192,10 +191,11 @@ def test_what_cannot_be_sensed_is_refused(few_trials):
         settings_of(hyrl_mj.get_task("field"), RunOptions(noise="bias 0.05"))
     with pytest.raises(BadInput, match="has no sensor of its own"):
         Noise("sensor", 0.1).against(vehicle, None)
-    task = hyrl_mj.from_gymnasium(Puck)
+    environment = copy(vehicle)
+    environment.abilities = replace(vehicle.abilities, side_by_side=8)
     with pytest.raises(BadInput, match="put Gymnasium's DelayObservation around it"):
-        Sensor.parse("delay 1").against(task, None)
-    assert Sensor.parse("bias 0.1").on(task)[0] == 0.1
+        Sensor.parse("delay 1").against(environment, None)
+    assert Sensor.parse("bias 0.1").on(environment)[0] == 0.1
 
 
 @register_noise
