@@ -112,7 +112,7 @@ def test_what_is_left_of_a_smooth_function_falls_with_the_square_of_the_box(vehi
 # ---- random programs
 
 # Number of programs; more of them by HYRL_MJ_PROGRAMS=20000.
-PROGRAMS = int(os.environ.get("HYRL_MJ_PROGRAMS", "200"))
+PROGRAMS = int(os.environ.get("HYRL_MJ_PROGRAMS", "100"))
 BOXES, DEPTH = 40, 5
 
 ONE = (

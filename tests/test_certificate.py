@@ -89,7 +89,7 @@ def played(game, loop, starts, noise, modes=None, seed=0):
 @pytest.mark.slow
 def test_no_noise_beats_what_is_proved_nor_arrives_later(certified):
     game, loops, certificate = certified
-    rng, cells, n = np.random.default_rng(0), certificate.cells, 200
+    rng, cells, n = np.random.default_rng(0), certificate.cells, 100
     for name, loop in loops.items():
         outer = certificate.value(name, EPS)
         noises = [Noise("uniform", EPS), Noise("alternating", EPS), game.worst_noise(name, EPS)]
@@ -198,6 +198,7 @@ def test_what_cannot_be_bounded_is_attacked_all_the_same(vehicle):
 @pytest.mark.slow
 def test_an_examination_carries_what_is_proved(vehicle, monkeypatch):
     monkeypatch.setattr(examination, "CURVE", (0.0, EPS))
+    monkeypatch.setattr(examination, "_replays", lambda certificate, scores: ())
     loops = {"policy": PolicyController(sideways(vehicle, 1, 1.1)), "hyrl": hybrid(vehicle)}
     result, maps = examination.worst_case(
         vehicle, np.array([[0.0, 0.0], [0.2, 0.0]]), halves(vehicle), loops, (0.0, EPS), cells=120
@@ -238,7 +239,9 @@ def test_where_runs_never_end_what_is_proved_stays_at_the_set_point(circle):
     assert certificate.wins("policy", 0.35) == (0.0, 0.0, 0.0, 0.0)
 
 
-def test_nothing_is_proved_of_a_start_region_that_is_thinner_than_a_cell(vehicle):
+def test_nothing_is_proved_of_a_start_region_that_is_thinner_than_a_cell(vehicle, monkeypatch):
+    monkeypatch.setattr(examination, "_replays", lambda certificate, scores: ())
+
     class Line(type(vehicle)):
         start_low, start_high = (0.0, -1.0), (0.0, 1.0)
 
@@ -298,7 +301,8 @@ def test_too_many_memories_are_not_played():
         ("uniform 0.08 + delay 0-2", "alternating 0.08 + delay 2"),
     ],
 )
-def test_no_such_sensor_beats_what_is_proved(text, stronger):
+def test_no_such_sensor_beats_what_is_proved(text, stronger, monkeypatch):
+    monkeypatch.setattr("hyrl_mj.judging.proof.sensed.BIASES", 4)
     sensor = Sensor.parse(text)
     bound, shares = sensor.on(get_task("vehicle"))
     task = get_task("vehicle").with_sensor(text, shares)

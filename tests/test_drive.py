@@ -331,7 +331,7 @@ def test_a_goal_that_a_post_stands_on_in_the_end_is_waited_for(planted, read):
 def test_who_waits_near_the_goal_has_not_arrived(planted, read):
     """A robot that stands still is not led to the goal by a post that stands close to it."""
     starts = [start(-1.5, 0), start(-1.4, 0.2), start(-1.2, 1), start(-6, 0)]
-    field = read(posts=[post(-0.7, 0)], starts=starts, time_s=3)
+    field = read(posts=[post(-0.7, 0)], starts=starts, time_s=1)
     for name in ("field", "rover_field"):
         task = hyrl_mj.get_task(name)
         steering = {side: Steering(task, side) for side in (LEFT, RIGHT)}
@@ -414,7 +414,7 @@ def test_more_noise_than_that_of_the_run_is_said(planted):
 
 def test_an_attack_is_at_least_as_bad(planted, read, monkeypatch):
     monkeypatch.setattr(drives, "ROUNDS", 1)
-    result = driven(planted, read(time_s=2), attack=True, eps=0.05)
+    result = driven(planted, read(time_s=1), attack=True, eps=0.05)
     assert set(result.attacked) == {"policy", "hyrl", "law"}
     assert result.attacked["hyrl"][0].noise == "attack"
     clearance = [

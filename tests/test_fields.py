@@ -204,7 +204,7 @@ def test_the_first_side_can_be_chosen(field):
 def test_the_guard_keeps_robots_off_posts_whatever_the_noise(field):
     rng, noise = np.random.default_rng(0), 0.1
     posts = [(-2.0, 0.0, 0.5), (0.0, 1.7, 0.9), (0.3, -1.4, 0.3), (-3.0, 2.0, 0.4)]
-    controller = straight(field, posts, noise)
+    controller = straight(field, posts, noise, time=5.0)
     task, n = controller.task, 50
     z = np.column_stack([rng.uniform(-4, 2, (4 * n, 2)), rng.uniform(-np.pi, np.pi, 4 * n)])
     places = np.array(posts)
@@ -324,7 +324,7 @@ def test_a_robot_is_driven_alone_as_among_others(field, posts):
 def test_a_controller_of_fields_is_exported(field, tmp_path):
     from onnxruntime import InferenceSession
 
-    controller = for_posts(field, {LEFT: Weighted(0), RIGHT: Weighted(1)}, 0.1, 3)
+    controller = for_posts(field, {LEFT: Weighted(0), RIGHT: Weighted(1)}, 0.1, 2)
     task, rng = controller.task, np.random.default_rng(0)
     poses = np.column_stack([rng.uniform(-6, 2, (40, 2)), rng.uniform(-3, 3, 40)])
     plant = task.plant(40)
@@ -399,7 +399,7 @@ def test_it_turns_at_the_rate_that_is_asked_for(rover, speed, rate):
 
 
 def test_no_sequence_of_inputs_tips_it_over(rover):
-    n, rng, low, high = 60, np.random.default_rng(0), *rover.input_limits
+    n, rng, low, high = 30, np.random.default_rng(0), *rover.input_limits
     plant = rover.plant(n)
     plant.set_state(*rover.state(rover.starts(n, rng)))
     for k in range(100):

@@ -113,7 +113,7 @@ def renamed(controller):
 
 # Cells 0.05 m wide: at half speed the vehicle ends between two nodes. Cells 0.1 m wide: always.
 TWINS = [
-    ("vehicle", (61, 21), sign_policy, (0.15, 0.15)),
+    ("vehicle", (31, 21), sign_policy, (0.1, 0.15)),
     ("vehicle", (31, 31), lambda task: renamed(ideal_controller(task, 0.07)), (0.0, 0.1)),
     ("unit_circle", (150,), circle_policy, (0.2,)),
     ("unit_circle", (150,), lambda task: renamed(circle_controller(task, 0.3)), (0.1,)),

@@ -108,7 +108,7 @@ def default(**options):
     return Budget(rounds=Effort().attack_rounds, **options)
 
 
-@pytest.mark.parametrize(("name", "make"), zip(SIGNALS, cycle(["one mode", "several modes"])))
+@pytest.mark.parametrize(("name", "make"), [*zip(SIGNALS, cycle(["one mode", "several modes"]))])
 def test_what_one_signal_breaks_is_broken(vehicle, name, make):
     signal, everywhere = SIGNALS[name], name == "the second column alone"
     start = STARTS[:1]
@@ -140,7 +140,7 @@ def test_all_are_tried_with_the_same_rules_and_several_modes_with_more(vehicle):
         "one": PolicyController(Rememberer(-5 * signal, 1.0)),
         "several": Watcher(-5 * signal, 1.0),
     }
-    found = attack(vehicle, loops, STARTS[:1], EPS, default())
+    found = attack(vehicle, loops, STARTS[:1], EPS, Budget(rounds=6))
     one, several = (found[name].count for name in loops)
     assert one.lost == several.lost == 0
     assert set(several.tried) - set(one.tried) == {"jump", "stay", "turn"}
