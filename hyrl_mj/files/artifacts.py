@@ -234,7 +234,7 @@ def read_record(path: Path, kind: str, record: type[Record], remedy: str = REMED
     return read_json(path, kind, lambda content: parsed(content, record, remedy), remedy)
 
 
-class Recorded:
+class SavedAsJson:
     """Base of the frozen dataclasses that are saved as a JSON file."""
 
     KIND: ClassVar[str]

@@ -19,7 +19,7 @@ JUDGED = 64
 
 
 @dataclass(frozen=True)
-class Arrivals(artifacts.Recorded):
+class Arrivals(artifacts.SavedAsJson):
     """From how many of its task's starts a policy arrives without noise, saved as `arrivals.json`.
 
     Attributes:
@@ -75,7 +75,7 @@ class ModeResult:
 
 
 @dataclass(frozen=True)
-class Retraining(artifacts.Recorded):
+class Retraining(artifacts.SavedAsJson):
     """How stage 6 ended: a result for each mode. Saved as `retraining.json`."""
 
     KIND: ClassVar[str] = "retraining"

@@ -273,7 +273,7 @@ class GameResult:
 
 
 @dataclass(frozen=True)
-class Robustness(artifacts.Recorded):
+class Robustness(artifacts.SavedAsJson):
     """The result of an examination under noise, saved as `robustness.json`.
 
     Attributes:
