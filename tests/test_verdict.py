@@ -10,7 +10,7 @@ from scored import SPACING, replays, score
 
 from hyrl_mj import BadArtifact
 from hyrl_mj.files import artifacts
-from hyrl_mj.judging import Arrivals, ModeResult, Retraining, results
+from hyrl_mj.judging import Arrivals, ModeResult, Retraining, VerdictSettings, results
 from hyrl_mj.judging.game import (
     LIMIT,
     AttackCount,
@@ -291,6 +291,11 @@ def test_less_noise_than_the_run_s_is_not_enough_and_more_is(circle):
 )
 def test_the_word_of_episodes(circle, robustness, expected):
     assert word(circle, robustness) == expected
+
+
+def test_fewer_episodes_than_are_asked_for_are_too_few(circle):
+    settings = VerdictSettings(episodes=1_001)
+    assert Verdict.judge(circle, EPS, enough({}), HOLDS, ALL, settings).word == UNDECIDED
 
 
 def test_what_is_missing_is_said_with_what_to_run(circle):
