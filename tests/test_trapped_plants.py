@@ -214,6 +214,7 @@ def test_who_hovers_beside_a_small_goal_has_not_arrived(tmp_path):
     ("name", "code"),
     [
         ("danger", "(self, measured):\n        return measured[:, 1] - measured[:, 1].mean()"),
+        ("miss", "(self, z):\n        return 9 + z[:, 1] - z[:, 1].min()"),
         ("state", "(self, z, rng=None):\n        return z, z - z.mean(axis=0)"),
         ("direction", "(self, path):\n        return np.random.randint(0, 2, path.shape[1])"),
     ],

@@ -25,7 +25,7 @@ from hyrl_mj.stages.partition import Partition
 from hyrl_mj.tasks import Outcome, check_task
 
 # Starts that are replayed of each robot, and the noise bound.
-STARTS, EPS = 60, 0.05
+STARTS, EPS = 30, 0.05
 NUMBER = itertools.count()  # names of tasks are used once
 
 MJCF = """<mujoco model="{name}">
