@@ -19,6 +19,7 @@ import pytest
 from filelock import FileLock
 
 import hyrl_mj
+from hyrl_mj.physics import mjcf
 from hyrl_mj.system import cores
 from hyrl_mj.tasks.scaffold import write_task
 
@@ -59,6 +60,18 @@ def memory_of_a_file():
     if platform.libc_ver()[0] == "glibc" and memory.now("VmRSS") > 600:
         gc.collect()
         ctypes.CDLL(None).malloc_trim(0)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def models_of_tests(request):
+    """MJCFs of tests are compiled at once: to try each in a process with limits before takes half a second.
+
+    In the files about what strangers wrote they are tried.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        if "doors" not in request.path.stem:
+            patch.setattr(mjcf, "_try", lambda path: None)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -7,7 +7,7 @@ import pytest
 from test_certificate import linear
 from test_checks import PY as PYTHON, XML, changed
 from test_truer_tasks import PY, write
-from trapped_plants import dial, drawn
+from trapped_plants import dial, task_of
 
 from hyrl_mj import BadInput, HybridController, Noise, get_task, simulate
 from hyrl_mj.judging.game import Lattice
@@ -120,13 +120,10 @@ def test_a_class_that_acts_otherwise_is_not_proved(controller, name, circle, cel
         BoundedAnswers.enclose(cells, loop, np.array([0.05]))
 
 
-def test_the_observation_of_another_task_is_looked_at_too(tmp_path, monkeypatch):
+def test_the_observation_of_another_task_is_looked_at_too(tmp_path):
     seen = "return np.hstack([np.cos(measured), np.sin(measured / 2)])"
     robots = [dial(), dial()._replace(py=dial().py | {"observation": seen})]
-    tasks = []
-    for robot in robots:
-        monkeypatch.setattr("trapped_plants.TRAPS", {"own": lambda rng, robot=robot: robot})
-        tasks.append(drawn(0, tmp_path)[1])
+    tasks = [task_of(robot, tmp_path) for robot in robots]
     chart = tasks[0].chart
     dials = Cells.cover(Lattice.tabulate(tasks[0], Grid.with_cells(chart, 600)))
     loop = PolicyController(linear(tasks[1], [[0.0, -3.0]], [0.0]))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from planted import decisions, halves, ideal_controller, one_way_policy, sign_policy
 
-from hyrl_mj import BadInput, LoopSettings, Noise, closed_loop
+from hyrl_mj import BadInput, Noise
 from hyrl_mj.judging import episodes as bulk
 from hyrl_mj.judging.episodes import Regions, noisy_episodes
 from hyrl_mj.judging.game import Ends, compare
@@ -20,7 +20,7 @@ def on_vehicle(vehicle):
         "sign": PolicyController(sign_policy(vehicle)),
         "ideal": ideal_controller(vehicle, 0.154, clear=1.004),
     }
-    grid = Grid.with_cells(vehicle.chart, 240)
+    grid = Grid.with_cells(vehicle.chart, 120)
     return Game(vehicle, halves(vehicle), controllers, 0.2, grid=grid), controllers
 
 
@@ -44,7 +44,7 @@ def records(vehicle, on_vehicle):
         Regions(decisions(vehicle).points, (game.lattice.grid, game.winnable(0.1))),
         {name: controllers[name] for name in ("sign", "ideal")},
         noises,
-        600,
+        300,
     ).counts
 
 
@@ -54,28 +54,25 @@ def test_the_counts_add_up(records):
         for name in ("sign", "ideal"):
             mine = [r for r in records if (r.noise, r.controller) == (noise, name)]
             assert {r.region for r in mine} == {"near M*", "elsewhere", "not winnable"}
-            assert sum(r.episodes for r in mine) == 600
+            assert sum(r.episodes for r in mine) == 300
             for r in mine:
                 assert sum(r.outcomes.values()) == r.episodes
                 assert r.reached == r.outcomes.get("reached", 0) / r.episodes
                 assert 0 <= r.interval[0] <= r.reached <= r.interval[1] <= 1
-
-
-def test_the_regions_hold_the_same_starts_for_all(records):
     for region in ("near M*", "elsewhere", "not winnable"):
-        assert len({r.episodes for r in records if r.region == region}) == 1
+        assert len({r.episodes for r in records if r.region == region}) == 1, "the same starts"
 
 
-def test_starts_near_the_critical_set_are_those_within_twice_the_noise(vehicle, on_vehicle):
+def test_starts_near_the_critical_set_are_those_within_twice_the_noise(vehicle):
     # Starts are uniform in 0 <= x <= 0.5, |y| <= 1, and M* runs along the axis up to x = 0.45.
-    left = {"left": on_vehicle[1]["left"]}
+    z0, regions = (
+        vehicle.starts(2_000, np.random.default_rng(0)),
+        Regions(decisions(vehicle).points),
+    )
     for eps in (0.05, 0.1):
-        records = noisy_episodes(
-            vehicle, Regions(decisions(vehicle).points), left, (Noise("uniform", eps),), 2000
-        ).counts
-        assert {r.region for r in records} == {"near M*", "elsewhere"}
-        near = record(records, "left", "near M*").episodes / 2000
-        assert near == pytest.approx(2 * eps, abs=0.03)
+        parts = regions.split(vehicle, eps, z0)
+        assert [*parts] == ["near M*", "elsewhere"]
+        assert parts["near M*"].mean() == pytest.approx(2 * eps, abs=0.03)
 
 
 def test_the_ideal_rule_reaches_the_set_point_from_all_winnable_starts(records):
@@ -110,7 +107,7 @@ def test_the_same_seed_gives_the_same_counts(vehicle, on_vehicle):
     def counts(seed):
         noises = (Noise("uniform", 0.2),)
         return noisy_episodes(
-            vehicle, Regions(decisions(vehicle).points), sign, noises, 300, seed=seed
+            vehicle, Regions(decisions(vehicle).points), sign, noises, 60, seed=seed
         )
 
     assert counts(3) == counts(3)
@@ -118,7 +115,7 @@ def test_the_same_seed_gives_the_same_counts(vehicle, on_vehicle):
 
 
 def test_batches_add_up_and_none_is_the_same(vehicle, on_vehicle, monkeypatch):
-    monkeypatch.setattr(bulk, "BATCH", 100)
+    monkeypatch.setattr(bulk, "BATCH", 50)
     sign, noises = {"sign": on_vehicle[1]["sign"]}, (Noise("uniform", 0.1),)
 
     def near(count):
@@ -127,7 +124,7 @@ def test_batches_add_up_and_none_is_the_same(vehicle, on_vehicle, monkeypatch):
         assert sum(r.episodes for r in records) == count
         return record(records, "sign", "near M*").episodes
 
-    one, two, more = (near(count) for count in (100, 200, 250))
+    one, two, more = (near(count) for count in (50, 100, 125))
     assert one < two < more
     assert two != 2 * one
 
@@ -136,7 +133,6 @@ def test_batches_add_up_and_none_is_the_same(vehicle, on_vehicle, monkeypatch):
     ("noise", "count", "message"),
     [
         (Noise("uniform", 0.1), 0, "0 episodes cannot be simulated"),
-        (Noise("uniform", 0.1), -5, "-5 episodes cannot be simulated"),
         (Noise("uniform", 0.1), 10**30, "at most 1,000,000,000"),
         (Noise("uniform", 1.5), 10, "noise bound 1.5 hides the whole state space of vehicle"),
     ],
@@ -147,23 +143,10 @@ def test_episodes_that_make_no_sense_are_refused(vehicle, on_vehicle, noise, cou
         noisy_episodes(vehicle, Regions(decisions(vehicle).points), sign, (noise,), count)
 
 
-@pytest.mark.parametrize("kind", ["uniform", "alternating", "adversarial"])
-def test_noise_everywhere_acts_on_every_column(vehicle, kind):
-    # A line at which the way is decided that runs askew, so that both columns matter.
-    loop = PolicyController(sign_policy(vehicle, lambda x: x - 0.3))
-    z0 = vehicle.starts(300, np.random.default_rng(0))
-    for everywhere, columns in ((False, [False, True]), (True, [True, True])):
-        noise = Noise(kind, 0.1, everywhere)
-        rollout = closed_loop(vehicle, loop, z0, noise, settings=LoopSettings(steps=1, record=True))
-        n = rollout.measured[0] - rollout.path[0]
-        assert np.abs(n).max() <= 0.1 + 1e-12
-        assert (np.abs(n).max(axis=0) > 0.05).tolist() == columns
-
-
 def test_controllers_are_compared_from_starts_that_all_win_without_noise(vehicle, on_vehicle):
     loops = {name: on_vehicle[1][name] for name in ("sign", "left")}
     noises = (Noise("none", 0.1), Noise("adversarial", 0.1))
-    found = noisy_episodes(vehicle, Regions(decisions(vehicle).points), loops, noises, 400)
+    found = noisy_episodes(vehicle, Regions(decisions(vehicle).points), loops, noises, 60)
     (compared,) = found.comparisons
     counted = {
         (c.noise, c.controller): sum(
@@ -172,8 +155,8 @@ def test_controllers_are_compared_from_starts_that_all_win_without_noise(vehicle
         for c in found.counts
     }
     assert compared.unaided == {name: counted["none", name] for name in loops}
-    assert compared.starts == 400
-    assert compared.compared >= 400 - sum(compared.unaided.values())
+    assert compared.starts == 60
+    assert compared.compared >= 60 - sum(compared.unaided.values())
     assert 0 < compared.lost["sign"] <= counted["adversarial", "sign"] - compared.unaided["sign"]
     assert compared.lost["left"] == 0
     assert compared.alone["sign"] <= compared.lost["sign"]
@@ -182,7 +165,7 @@ def test_controllers_are_compared_from_starts_that_all_win_without_noise(vehicle
     assert (
         compared.difference == (compared.lost["sign"] - compared.lost["left"]) / compared.compared
     )
-    quiet = noisy_episodes(vehicle, Regions(np.empty((0, 2))), loops, (noises[1],), 40)
+    quiet = noisy_episodes(vehicle, Regions(np.empty((0, 2))), loops, (noises[1],), 8)
     assert quiet.comparisons == (), "without noise nothing was played"
 
 
@@ -216,7 +199,7 @@ def test_the_interval_of_a_paired_difference_covers_it():
     # Both controllers lose together more often than apart; 95% of the intervals hold the difference.
     rng, both, first, last, n = np.random.default_rng(0), 0.1, 0.08, 0.02, 200
     held = []
-    for _ in range(2_000):
+    for _ in range(1_000):
         kind = rng.choice(4, n, p=(both, first, last, 1 - both - first - last))
         ends = {
             "policy": Ends(np.isin(kind, (0, 1)), np.ones(n), np.ones(n)),

@@ -17,16 +17,18 @@ from hyrl_mj.task_tests import random_inputs
 from hyrl_mj.tasks import get_task
 from hyrl_mj.tasks.vehicle import Vehicle
 
-PAIRS = 10_000
+PAIRS = 2_000
 
 
-def test_one_sample_is_the_papers_equation(task):
+def test_one_sample_is_the_papers_equation_and_a_step_backward_inverts_it(task):
     rng = np.random.default_rng(1)
     z, u = random_states(task, PAIRS, rng), random_inputs(task, PAIRS, rng)
     plant = task.plant(PAIRS)
     plant.set_state(task.state(z)[0])
     plant.step(u)
     np.testing.assert_allclose(task.z(plant.measurement), euler(task, z, u), rtol=0, atol=1e-6)
+    plant.step_backward(u)
+    np.testing.assert_allclose(task.z(plant.measurement), z, rtol=0, atol=1e-6)
 
 
 def test_whole_episodes_are_the_papers_equation(task):
@@ -39,16 +41,6 @@ def test_whole_episodes_are_the_papers_equation(task):
         z = euler(task, z, u)
         plant.step(u)
         np.testing.assert_allclose(task.z(plant.measurement), z, rtol=0, atol=1e-6)
-
-
-def test_step_backward_inverts_step(task):
-    rng = np.random.default_rng(3)
-    z, u = random_states(task, PAIRS, rng), random_inputs(task, PAIRS, rng)
-    plant = task.plant(PAIRS)
-    plant.set_state(task.state(z)[0])
-    plant.step(u)
-    plant.step_backward(u)
-    np.testing.assert_allclose(task.z(plant.measurement), z, rtol=0, atol=1e-6)
 
 
 def test_step_backward_moves_the_other_way(task):
@@ -157,35 +149,24 @@ def test_input_limits_and_sample_time_stand_in_the_mjcf(task):
 
 # ---- bad input
 
-BAD_INPUTS = {
-    "nan": np.array([[0.0], [0.0], [np.nan]]),
-    "inf": np.array([[0.0], [0.0], [-np.inf]]),
-    "too much": np.array([[0.0], [0.0], [1.5]]),
-}
 
-
-@pytest.mark.parametrize("u", BAD_INPUTS.values(), ids=BAD_INPUTS.keys())
-def test_a_bad_input_names_its_simulation_and_changes_nothing(task, u):
-    plant = task.plant(3)
-    plant.set_state(task.state(np.array(task.scene.starts[:3]))[0])
-    before = plant.state
-    with pytest.raises(BadInput, match=r"simulation 2") as caught:
-        plant.step(u)
-    assert f"{u[2, 0]:g}" in str(caught.value)
-    np.testing.assert_array_equal(plant.state, before)
-
-
-@pytest.mark.parametrize("value", [np.nan, 1.5])
-def test_a_bad_input_to_some_copies_names_the_copy(vehicle, value):
+@pytest.mark.parametrize("value", [np.nan, -np.inf, 1.5])
+def test_a_bad_input_names_its_simulation_and_changes_nothing(vehicle, value):
     plant = vehicle.plant(5)
     plant.set_state(np.zeros((5, 2)))
-    with pytest.raises(BadInput, match=r"simulation 4"):
-        plant.step(np.array([[0.0], [value]]), np.array([1, 4]))
+    before, u = plant.state, np.zeros((5, 1))
+    u[2] = value
+    for inputs, ids, number in ((u, None, 2), (u[1:3], np.array([1, 4]), 4)):
+        with pytest.raises(
+            BadInput, match=rf"simulation {number}.*{value:g}|{value:g}.*simulation"
+        ):
+            plant.step(inputs, *([] if ids is None else [ids]))
+        np.testing.assert_array_equal(plant.state, before)
 
 
-@pytest.mark.parametrize("shape", [(3,), (3, 2), (2, 1), (1, 3)])
-def test_an_input_of_the_wrong_shape_says_the_right_one(task, shape):
-    plant = task.plant(3)
+@pytest.mark.parametrize("shape", [(3,), (3, 2), (2, 1)])
+def test_an_input_of_the_wrong_shape_says_the_right_one(vehicle, shape):
+    plant = vehicle.plant(3)
     before = plant.state
     with pytest.raises(BadInput, match=r"\(3, 1\)"):
         plant.step(np.zeros(shape))
@@ -193,7 +174,8 @@ def test_an_input_of_the_wrong_shape_says_the_right_one(task, shape):
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_a_bad_state_names_its_simulation_and_changes_nothing(task, value):
+def test_a_bad_state_names_its_simulation_and_changes_nothing(vehicle, value):
+    task = vehicle
     plant = task.plant(3)
     plant.set_state(task.state(np.array(task.scene.starts[:3]))[0])
     before, qpos = plant.state, plant.qpos
@@ -316,10 +298,9 @@ def gone_on(plant, inputs):
     return plant.state
 
 
-@pytest.mark.parametrize("name", ["vehicle", "rover"])
 @pytest.mark.parametrize(
-    "copied",
-    [copy.deepcopy, lambda plant: pickle.loads(pickle.dumps(plant))],
+    ("name", "copied"),
+    [("vehicle", copy.deepcopy), ("rover", lambda plant: pickle.loads(pickle.dumps(plant)))],
     ids=["copy", "pickle"],
 )
 def test_a_copy_goes_on_to_the_bit(name, copied):
@@ -334,8 +315,8 @@ def test_a_copy_goes_on_to_the_bit(name, copied):
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
 @pytest.mark.parametrize("threads", [1, 2])
-def test_a_forked_process_goes_on_to_the_bit_and_ends(task, threads):
-    plant, inputs = in_its_middle(task, threads)
+def test_a_forked_process_goes_on_to_the_bit_and_ends(vehicle, threads):
+    plant, inputs = in_its_middle(vehicle, threads)
     reader, writer = os.pipe()
     child = os.fork()
     if not child:  # a process that hangs is ended by its alarm
@@ -350,13 +331,13 @@ def test_a_forked_process_goes_on_to_the_bit_and_ends(task, threads):
     assert told == gone_on(plant, inputs).tobytes()
 
 
-@pytest.mark.parametrize("n", [0, -1, 1.5, True, None])
+@pytest.mark.parametrize("n", [0, 1.5, True])
 def test_a_number_of_copies_that_is_none_is_refused(vehicle, n):
     with pytest.raises(BadInput, match=r"the number of copies of a robot .* from 1 to"):
         vehicle.plant(n)
 
 
-@pytest.mark.parametrize("timestep", ["0.03", "0.07", "0.2"])
+@pytest.mark.parametrize("timestep", ["0.03", "0.2"])
 def test_a_sample_of_no_whole_number_of_steps_is_refused(timestep):
     xml = (
         f'<mujoco model="odd"><option timestep="{timestep}"/><custom><numeric name="sample_time" '

@@ -70,26 +70,11 @@ def formula_run(task, controller, z, q, bound):
     return np.array(path), modes, outcome or task.verdict(z[None])[0]
 
 
-def plant_run(task, controller, z, bound):
-    """The same in MuJoCo, one simulation by itself: its path."""
-    plant, q = task.plant(1, threads=1), np.zeros(1, dtype=int)
-    plant.set_state(task.state(z[None])[0])
-    path = [plant.measurement[0]]
-    for k in range(task.max_steps):
-        if task.ending(plant.measurement)[0] != Outcome.RUNNING:
-            break
-        noise = np.where(task.noisy, bound if k % 2 == 0 else -bound, 0.0)
-        u, q = controller.step(q, plant.measurement + noise)
-        plant.step(u)
-        path.append(plant.measurement[0])
-    return np.array(path)
-
-
 def cases(circle, vehicle):
-    theta = np.random.default_rng(0).uniform(0, 2 * np.pi, (40, 1))
+    theta = np.random.default_rng(0).uniform(0, 2 * np.pi, (15, 1))
     return [
-        (vehicle, ideal_controller(vehicle, 0.15), vehicle_starts(40)),
-        (vehicle, PolicyController(sign_policy(vehicle)), vehicle_starts(40)),
+        (vehicle, ideal_controller(vehicle, 0.15), vehicle_starts(15)),
+        (vehicle, PolicyController(sign_policy(vehicle)), vehicle_starts(15)),
         (circle, PolicyController(circle_policy(circle)), theta),
     ]
 
@@ -107,15 +92,6 @@ def test_it_equals_the_formula_one_by_one(circle, vehicle):
             np.testing.assert_allclose(rollout.path[: end + 1, i], path, rtol=0, atol=1e-6)
             np.testing.assert_array_equal(rollout.q[:end, i], modes)
             assert rollout.outcome[i] == outcome
-
-
-def test_it_equals_single_simulations_to_the_bit(circle, vehicle):
-    for task, controller, starts in cases(circle, vehicle):
-        q0 = np.zeros(len(starts), dtype=int)
-        rollout = closed_loop(task, controller, starts, noise=ALTERNATING, q0=q0)
-        for i, start in enumerate(starts[:10]):
-            path = plant_run(task, controller, start, 0.1)
-            np.testing.assert_array_equal(rollout.path[: rollout.length[i] + 1, i], path)
 
 
 def test_a_run_that_ended_stays_where_it_ended(vehicle):
@@ -174,38 +150,24 @@ def test_noise_stalls_the_plain_policy_on_the_circle(circle):
 # ---- hybrid arcs
 
 
-def test_time_doubles_exactly_where_j_rises(jumping_arc):
-    dt, dj = np.diff(jumping_arc.t), np.diff(jumping_arc.j)
+def test_time_doubles_and_modes_change_exactly_where_j_rises(jumping_arc):
+    dt, jump = np.diff(jumping_arc.t), np.diff(jumping_arc.j) == 1
     assert jumping_arc.j[-1] >= 5, "the case has jumps"
     assert (jumping_arc.t[0], jumping_arc.j[0]) == (0.0, 0)
-    assert (dt >= 0).all()
-    np.testing.assert_array_equal(dj == 1, dt == 0)
-    np.testing.assert_array_equal(dj == 0, dt > 0)
+    np.testing.assert_array_equal(jump, dt == 0)
+    np.testing.assert_array_equal(~jump, dt > 0)
     np.testing.assert_allclose(dt[dt > 0], 0.05)
-
-
-def test_modes_change_only_at_jumps_and_nothing_else_does(jumping_arc):
-    jump = np.diff(jumping_arc.j) == 1
     np.testing.assert_array_equal(np.diff(jumping_arc.q) != 0, jump)
     before, after = np.flatnonzero(jump), np.flatnonzero(jump) + 1
     for values in (jumping_arc.z, jumping_arc.measured, jumping_arc.state):
         np.testing.assert_array_equal(values[before], values[after])
     assert np.isnan(jumping_arc.u[before]).all(), "a jump costs no time"
     assert np.isfinite(jumping_arc.u[after]).all()
-
-
-def test_the_last_row_ends_the_arc(jumping_arc):
-    assert np.isnan(jumping_arc.u[-1]).all()
+    assert np.isnan(jumping_arc.u[-1]).all(), "the last row ends the arc"
     assert np.isnan(jumping_arc.measured[-1]).all()
     assert np.isfinite(jumping_arc.z[-1]).all()
     rows = ("t", "j", "z", "measured", "q", "u", "state")
     assert len({len(getattr(jumping_arc, name)) for name in rows}) == 1
-
-
-def test_every_flow_step_is_the_plants_equation(jumping_arc, vehicle):
-    flow = np.flatnonzero(np.diff(jumping_arc.t) > 0)
-    expected = euler(vehicle, jumping_arc.z[flow], jumping_arc.u[flow])
-    np.testing.assert_allclose(jumping_arc.z[flow + 1], expected, atol=1e-6)
 
 
 def test_the_input_is_what_the_mode_says(jumping_arc, chattering):
@@ -288,7 +250,7 @@ def test_a_phase_that_passes_pi_is_not_wrapped_either(circle):
     np.testing.assert_allclose(*(critical.points for critical in found), atol=1e-9)
     # The worst noise is recorded as noise, not as noise and a turn.
     controllers = {"policy": PolicyController(policy)}
-    grid = Grid.with_cells(phase.chart, 300)
+    grid = Grid.with_cells(phase.chart, 150)
     game = Game(phase, halves(circle), controllers, 0.3, grid=grid)
     signal = worst_signal(game, "policy", np.array([[3.0]]), 0.3)
     assert np.abs(signal.values).max() <= 0.3 + 1e-9
@@ -395,32 +357,25 @@ def test_noise_acts_on_the_noisy_columns_only(jumping_arc):
 # ---- bad input
 
 
-@pytest.mark.parametrize("horizon", [0, -1.0, np.nan, np.inf])
-def test_a_horizon_that_is_none(vehicle, horizon):
-    with pytest.raises(BadInput, match=rf"horizon {horizon:g} s .*time > 0"):
-        simulate(vehicle, sign_policy(vehicle), np.zeros(2), horizon=horizon)
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"horizon": 0}, "horizon 0 s .*time > 0"),
+        ({"horizon": np.nan}, "horizon nan s .*time > 0"),
+        ({"horizon": np.inf}, "horizon inf s .*time > 0"),
+        ({"z0": [0.0, 2.0]}, r"y = 2 m\) is outside vehicle"),
+        ({"z0": np.zeros(3)}, "vehicle is 2 number"),
+        ({"z0": np.zeros((0, 2))}, r"got shape \(0, 2\)"),
+        ({"q0": 2}, r"mode 2 is unknown: choose one of \(0, 1\)"),
+        ({"q0": 0.5}, r"mode 0.5 is unknown: choose one of \(0, 1\)"),
+        ({"z0": np.zeros((3, 2)), "q0": np.array([0, 1])}, r"\(2,\)"),
+    ],
+)
+def test_what_cannot_be_simulated_is_refused(vehicle, options, says):
+    with pytest.raises(BadInput, match=says):
+        simulate(vehicle, ideal_controller(vehicle), **{"z0": np.zeros(2), **options})
 
 
-def test_a_start_outside_the_arena(vehicle):
-    with pytest.raises(BadInput, match=r"y = 2 m\) is outside vehicle"):
-        simulate(vehicle, sign_policy(vehicle), np.array([0.0, 2.0]))
-    with pytest.raises(BadInput, match="vehicle is 2 number"):
-        simulate(vehicle, sign_policy(vehicle), np.zeros(3))
-
-
-@pytest.mark.parametrize("mode", [2, -1, 0.5])
-def test_an_unknown_mode(vehicle, mode):
-    with pytest.raises(BadInput, match=rf"mode {mode} is unknown: choose one of \(0, 1\)"):
-        simulate(vehicle, ideal_controller(vehicle), np.zeros(2), q0=mode)
+def test_a_policy_has_one_mode(vehicle):
     with pytest.raises(BadInput, match=r"mode 1 is unknown: choose one of \(0,\)"):
         simulate(vehicle, sign_policy(vehicle), np.zeros(2), q0=1)
-
-
-def test_start_modes_that_do_not_match_the_starts(vehicle):
-    with pytest.raises(BadInput, match=r"\(2,\)"):
-        simulate(vehicle, ideal_controller(vehicle), np.zeros((3, 2)), q0=np.array([0, 1]))
-
-
-def test_no_starts_at_all(vehicle):
-    with pytest.raises(BadInput):
-        simulate(vehicle, ideal_controller(vehicle), np.zeros((0, 2)))

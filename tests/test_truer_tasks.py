@@ -25,7 +25,7 @@ from hyrl_mj.simulation import Recorded, Signal, judge_task, noise as noises, re
 from hyrl_mj.simulation.real import fresh_model
 from hyrl_mj.tasks import Outcome, check_as_made, check_task, checks, described_task, trial
 
-_, XML, PY, *_ = vehicle()
+XML, PY, *_ = vehicle()
 NAMES = iter(range(1_000))
 CRASH = "<= 0.6]"
 # A robot that is the same at each physics step, whose inner loop the task gives.
@@ -640,8 +640,8 @@ def test_who_is_still_under_way_has_not_arrived_where_the_end_says_who_has(
         (dial(), '("theta",), ("deg",), (0.0,), (360.0,), (True,)'),
     ],
 )
-def test_a_period_that_is_no_whole_turn_is_refused(robot, chart, tmp_path, monkeypatch):
-    task = task_of(robot._replace(py=robot.py | {"chart": chart}), tmp_path, monkeypatch)
+def test_a_period_that_is_no_whole_turn_is_refused(robot, chart, tmp_path):
+    task = task_of(robot._replace(py=robot.py | {"chart": chart}), tmp_path)
     with pytest.raises(
         BadInput, match=r"is periodic and comes back after .* the robot is elsewhere"
     ):

@@ -10,7 +10,7 @@ from scored import SPACING, replays, score
 
 from hyrl_mj import BadArtifact
 from hyrl_mj.files import artifacts
-from hyrl_mj.judging import Arrivals, ModeResult, Retraining
+from hyrl_mj.judging import Arrivals, ModeResult, Retraining, VerdictSettings, results
 from hyrl_mj.judging.game import (
     LIMIT,
     AttackCount,
@@ -191,10 +191,11 @@ def test_a_split_that_makes_most_starts_unwinnable_has_no_first_word(circle):
         )
 
 
-def test_without_noise_all_that_counts_is_that_everything_is_won(circle):
-    assert word(circle, game((1.0,), (1.0,), bounds=(0.0,)), bound=0.0) == WON
-    assert word(circle, game((1.0,), (0.9,), bounds=(0.0,)), bound=0.0) == FAILED
-    assert word(circle, game((0.8,), (0.9,), bounds=(0.0,)), bound=0.0) == WEAK
+@pytest.mark.parametrize(
+    ("policy", "hyrl", "expected"), [(1.0, 1.0, WON), (1.0, 0.9, FAILED), (0.8, 0.9, WEAK)]
+)
+def test_without_noise_all_that_counts_is_that_everything_is_won(circle, policy, hyrl, expected):
+    assert word(circle, game((policy,), (hyrl,), bounds=(0.0,)), bound=0.0) == expected
 
 
 @pytest.mark.parametrize("proved", [1.0, None])
@@ -292,6 +293,11 @@ def test_the_word_of_episodes(circle, robustness, expected):
     assert word(circle, robustness) == expected
 
 
+def test_fewer_episodes_than_are_asked_for_are_too_few(circle):
+    settings = VerdictSettings(episodes=1_001)
+    assert Verdict.judge(circle, EPS, enough({}), HOLDS, ALL, settings).word == UNDECIDED
+
+
 def test_what_is_missing_is_said_with_what_to_run(circle):
     verdict = Verdict.judge(circle, EPS, enough({"uniform": 996}, attacked=200), HOLDS, ALL)
     assert str(verdict) == (
@@ -322,48 +328,6 @@ def test_better_is_what_the_same_starts_show(circle, vehicle):
     for task in (circle, goes_on):
         assert "late" not in comparison_sentence(task, far.comparisons[0])
         assert "-" in comparison_table(task, far.comparisons).rows[0]
-
-
-def test_each_word_is_said_only_where_its_condition_holds(circle):
-    rng, words = np.random.default_rng(0), []
-    for _ in range(500):
-        n = int(rng.choice((300, 1_000, 4_000)))
-        kinds = ["none", "uniform", "alternating", "adversarial"]
-        kinds = [kind for kind in kinds if rng.random() < 0.95]
-        won = {
-            kind: n
-            - int(n * rng.choice((0, 0, 0, 0.001, 0.005, 0.1), p=(0.3, 0.3, 0.2, 0.1, 0.05, 0.05)))
-            for kind in kinds
-        }
-        attacked, share = int(rng.choice((100, 400, 2_000))), rng.choice((0, 0, 0.003, 0.05))
-        lost = int(share * attacked)
-        counts = [
-            EpisodeCount(
-                kind, EPS, False, who, "elsewhere", n, {"reached": w, "crashed": n - w}, w / n, (0.0, 1.0)
-            )
-            for who in ("policy", "hyrl")
-            for kind, w in (won if who == "hyrl" else dict.fromkeys(kinds, n // 2)).items()
-        ]  # fmt: skip
-        attacks = (attack_count("policy", attacked, attacked), attack_count("hyrl", attacked, lost))
-        with_attack = rng.random() < 0.9
-        robustness = Robustness(EPS, False, None, tuple(counts), 0, attacks if with_attack else ())
-        shares = [(w, n) for w in won.values()]
-        if with_attack:
-            shares.append((attacked - lost, attacked))
-        held = (
-            with_attack
-            and len(kinds) == 4
-            and n >= 1_000
-            and attacked >= 300
-            and all(wilson(w, total)[0] >= 0.99 for w, total in shares)
-        )
-        refuted = any(wilson(w, total)[1] < 0.99 for w, total in shares)
-        under_noise = with_attack or set(kinds) - {"none"}
-        found = word(circle, robustness)
-        assert (found == HELD) == held
-        assert (found == UNDECIDED) == (bool(under_noise) and not held and not refuted)
-        words.append(found)
-    assert min(map(words.count, (HELD, UNDECIDED, WEAK))) > 20
 
 
 # ---- what is said, and kept
@@ -413,12 +377,13 @@ def test_a_share_that_is_a_word_is_refused(tmp_path):
         Retraining.load(tmp_path / "retraining.json")
 
 
-def test_arrivals_are_those_of_simulations(vehicle):
+def test_arrivals_are_those_of_simulations(vehicle, monkeypatch):
+    monkeypatch.setattr(results, "EPISODES", 100)
     policy = one_way_policy(vehicle, 1.0)  # it goes on beside the set-point
     found = Arrivals.measure(vehicle, policy)
     arcs = simulate(
-        vehicle, PolicyController(policy), vehicle.starts(1_000, np.random.default_rng(0))
+        vehicle, PolicyController(policy), vehicle.starts(100, np.random.default_rng(0))
     )
     assert found.arrived == sum(arc.outcome == "reached" for arc in arcs)
-    assert found.missed == found.arrived > 500
+    assert found.missed == found.arrived > 50
     assert f"in {found.missed:,} of them off the set-point" in str(found)

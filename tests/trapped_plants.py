@@ -1,7 +1,7 @@
 """Robots with planted traps: plants and task files in which something is not what it seems.
 
-Each is drawn from a seed: a vehicle that passes a pillar, or a pointer on a dial, with one of `TRAPS` in its
-files. `examined` tells what the package says of it, and plays what it calls won with `mujoco.mj_step` alone.
+Each of `ROBOTS` is a vehicle that passes a pillar, or a pointer on a dial, with one trap in its files.
+`examined` tells what the package says of it, and plays what it calls won with `mujoco.mj_step` alone.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from hyrl_mj.stages.partition import Partition
 from hyrl_mj.tasks import Outcome, check_task
 
 # Starts that are replayed of each robot, and the noise bound.
-STARTS, EPS = 60, 0.05
+STARTS, EPS = 30, 0.05
 NUMBER = itertools.count()  # names of tasks are used once
 
 MJCF = """<mujoco model="{name}">
@@ -95,9 +95,8 @@ FILTERED = (
 
 
 class Robot(NamedTuple):
-    """A drawn robot: its trap, its files and how its policy steers."""
+    """A robot: what its files hold in the places of the templates."""
 
-    trap: str
     xml: dict[str, str]
     py: dict[str, str]
     servo: str
@@ -126,7 +125,7 @@ def vehicle():
         "        ends[np.sqrt((x - 1.5) ** 2 + y**2) <= 0.6] = Outcome.CRASHED",
         "methods": "", "levels": "5",
     }  # fmt: skip
-    return Robot("", xml, py, "", "", 1e9, "")
+    return Robot(xml, py, "", "", 1e9, "")
 
 
 def dial():
@@ -145,7 +144,7 @@ def dial():
         "methods": "    def miss(self, z):\n"
         "        return np.abs(self.chart.difference(z, self.set_point))[:, 0]\n",
     }  # fmt: skip
-    return Robot("", xml, py, "", "", 1e9, "")
+    return Robot(xml, py, "", "", 1e9, "")
 
 
 def ends(robot, code):
@@ -156,163 +155,76 @@ def methods(robot, code):
     return robot._replace(py=robot.py | {"methods": robot.py["methods"] + code})
 
 
-def undefined(rng):
-    """A quantity that is NaN in a band of x, and no less than -1 elsewhere."""
-    a = rng.uniform(0.8, 2.2)
-    b = a + rng.uniform(0.15, 0.6)
-    band = f"(x - {a:.4f}) * (x - {b:.4f})"
-    return str(
-        rng.choice(
-            [
-                f"np.sqrt({band})",
-                f"({band}) ** 0.5",
-                f"np.exp(np.log({band}))",
-                f"np.arccos(1 - np.minimum({band}, 1))",
-                f"np.maximum(np.sqrt({band}), 0)",
-                f"np.where({band} < 0, np.nan, 1.0)",
-                f"np.abs(np.divide(np.maximum({band}, 0), np.maximum({band}, 0)))",
-            ]
-        )
+def mirrored(radius):
+    """A vehicle that is no mirror image, because of a second obstacle."""
+    robot = ends(
+        vehicle(), f"ends[(x - 2.4) ** 2 + (y - 0.8) ** 2 <= {radius} ** 2] = Outcome.CRASHED"
     )
+    post = f'<geom name="obstacle_b" size="{radius}" pos="2.4 0.8 0" contype="0" conaffinity="0"/>'
+    xml = robot.xml | {"scenery": robot.xml["scenery"] + post}
+    return robot._replace(xml=xml, py=robot.py | {"mirror": "Mirror((1, -1), (-1,))"})
 
 
-def trap_honest(rng):
-    return vehicle() if rng.random() < 0.6 else dial()
-
-
-def trap_delay(rng):
-    robot, samples = trap_honest(rng), int(rng.integers(1, 8))
-    return robot._replace(servo=f'delay="{0.05 * samples:.2f}" nsample="{samples + 1}"')
-
-
-def trap_filter(rng):
-    robot, kind = trap_honest(rng), rng.choice(["filter", "filterexact"])
-    return robot._replace(servo=f'dyntype="{kind}" dynprm="{rng.uniform(0.03, 0.5):.3f}"')
-
-
-def trap_lag(rng):
-    robot = vehicle()
-    return robot._replace(xml=robot.xml | {"mass": f"{10 ** rng.uniform(1.5, 6):.4g}"}, kv=1e6)
-
-
-def trap_nan(rng):
-    robot = vehicle()
-    kind, value = rng.integers(3), undefined(rng)
-    if kind == 0:
-        return ends(robot, f"ends[~(-1 <= {value})] = Outcome.CRASHED")
-    if kind == 1:
-        return ends(robot, f"ends = np.where({value} >= -1, ends, Outcome.CRASHED)")
-    seen = "x, y = measured.T\n        "
-    seen += f"return np.stack([x, np.where(-1 <= {value}, y, -9 * np.sign(y) * x)], axis=1)"
-    return robot._replace(py=robot.py | {"observation": seen})
-
-
-def trap_turns(rng):
-    robot, side = dial(), rng.choice([-1, 1])
-    first = rng.uniform(0.3, 9.0)
-    kind = rng.integers(3)
-    if kind == 0:
-        return ends(robot, f"ends[{side} * theta >= {first:.4f} + 2 * np.pi] = Outcome.CRASHED")
-    if kind == 1:
-        wide = rng.choice([1e-3, 0.03, 0.3])
-        place = side * (first + 2 * np.pi)
-        return ends(robot, f"ends[np.abs(theta - {place:.4f}) < {wide}] = Outcome.CRASHED")
-    seen = f"return np.hstack([np.cos(measured), np.sin(measured / {int(rng.integers(2, 5))})])"
-    return robot._replace(py=robot.py | {"observation": seen})
-
-
-def trap_saturation(rng):
-    robot, force = vehicle()._replace(kv=1e6), 10 ** rng.uniform(-1, 4)
-    if rng.random() < 0.5:
-        return robot._replace(servo=f'forcerange="-{force:.4g} {force:.4g}"')
-    return robot._replace(on_joint=f'actuatorfrcrange="-{force:.4g} {force:.4g}"')
-
-
-def trap_held_sensor(rng):
-    robot, samples = trap_honest(rng), int(rng.integers(2, 9))
-    if rng.random() < 0.5:
-        return robot._replace(sensor=f'interval="{0.05 * samples:.2f}" nsample="3"')
-    return robot._replace(sensor=f'delay="{0.05 * samples:.2f}" nsample="{samples + 1}"')
-
-
-def trap_thin_wall(rng):
-    robot, x, w = vehicle(), rng.uniform(0.7, 2.5), 10 ** rng.uniform(-3, -1)
-    if rng.random() < 0.5:  # ended by ending(), which is asked at samples
-        return ends(robot, f"ends[np.abs(x - {x:.4f}) < {w:.5f}] = Outcome.CRASHED")
-    wall = f'<geom name="wall" type="box" size="{w:.5f} 3 0.2" pos="{x:.4f} 0 0"/>'
-    scenery = robot.xml["scenery"] + wall
-    return robot._replace(xml=robot.xml | {"flag": "", "contact": "1", "scenery": scenery}, kv=1e6)
-
-
-def trap_mirror(rng):
-    robot, x, y = vehicle(), rng.uniform(0.6, 2.6), rng.uniform(0.7, 1.2) * rng.choice([-1, 1])
-    r = rng.uniform(0.1, 0.3)
-    code = f"ends[(x - {x:.3f}) ** 2 + (y - {y:.3f}) ** 2 <= {r:.3f} ** 2] = Outcome.CRASHED"
-    robot = ends(robot, code)
-    return robot._replace(py=robot.py | {"mirror": "Mirror((1, -1), (-1,))"})
-
-
-def trap_starts(rng):
-    off = rng.uniform(0.02, 0.4)
-    code = (
-        "\n    def starts(self, n, rng):\n"
-        f"        return rng.uniform((0.0, -1.0), (0.4 + {off:.3f}, 1.0), (n, 2))\n"
-    )
-    return methods(vehicle(), code)
-
-
-def trap_methods(rng):
-    """A method that a proof takes for the default one."""
-    robot, by = vehicle(), rng.uniform(0.05, 0.4)
-    return methods(
-        robot,
-        [
-            f"\n    def measure(self, sensors):\n        return sensors + np.array([0.0, {by:.3f}])\n",
-            f"\n    def measure(self, sensors):\n        return np.minimum(sensors, {3 - by:.3f})\n",
-            "\n    def outcome(self, measurement, unstable):\n"
-            f"        return np.where(measurement[:, 0] > {3 - by:.3f}, Outcome.CRASHED, "
-            "self.ending(measurement))\n",
-            "\n    def failed(self, measurement):\n        return np.zeros(len(measurement), dtype=bool)\n",
-        ][rng.integers(4)],
-    )
-
-
-def trap_sensor(rng):
-    """A sensor that gives something else than the position."""
-    robot = vehicle()
-    return robot._replace(sensor=f'cutoff="{rng.uniform(2.0, 2.99):.3f}"')
-
-
-def trap_memory(rng):
-    """An end that depends on how often it was asked, or on other rows."""
-    if rng.random() < 0.5:
-        code = "self.count = self.count + 1\n        "
-        code += f"ends[(self.count % {int(rng.integers(3, 60))} == 0) & (x > 1)] = Outcome.CRASHED"
-        return ends(vehicle(), code)
-    return ends(vehicle(), "ends[(x > 1) & (y > np.sort(y)[-1] - 0.01)] = Outcome.CRASHED")
-
-
-def trap_spring(rng):
-    """A tendon that pulls in a part of the arena alone, against a weak servo."""
-    robot, start = vehicle(), rng.uniform(1.0, 2.5)
-    more = (
-        f'<tendon><fixed name="t" stiffness="1e7" springlength="-9 {start:.3f}"><joint joint="x" coef="1"/>'
-        "</fixed></tendon>"
-    )
-    return robot._replace(xml=robot.xml | {"more": more}, kv=1e6)
-
-
-TRAPS = {
-    name.removeprefix("trap_"): draw
-    for name, draw in list(globals().items())
-    if name.startswith("trap_")
+BAND = "(x - 1.1) * (x - 1.5)"  # less than 0 between these
+# Robots by what is wrong with them.
+ROBOTS = {
+    "nothing": vehicle(),
+    "nothing of a dial": dial(),
+    "delay": vehicle()._replace(servo='delay="0.05" nsample="2"'),
+    "filter": dial()._replace(servo='dyntype="filterexact" dynprm="0.2"'),
+    "lag": vehicle()._replace(kv=1e6, xml=vehicle().xml | {"mass": "1000"}),
+    "spring": vehicle()._replace(kv=1e7, on_joint='stiffness="1e7"'),
+    "tendon": vehicle()._replace(
+        kv=1e6,
+        xml=vehicle().xml
+        | {
+            "more": '<tendon><fixed name="t" stiffness="1e7" springlength="-9 2"><joint joint="x" coef="1"/>'
+            "</fixed></tendon>"
+        },
+    ),
+    "weak servo": vehicle()._replace(kv=1e6, servo='forcerange="-5 5"'),
+    "weak joint": vehicle()._replace(kv=1e6, on_joint='actuatorfrcrange="-5 5"'),
+    "NaN": ends(vehicle(), f"ends[~(np.sqrt({BAND}) >= -1) & (x > 0.5)] = Outcome.CRASHED"),
+    "NaN where it chooses": ends(
+        vehicle(), f"ends = np.where(np.log({BAND}) >= -99, ends, Outcome.CRASHED)"
+    ),
+    "a far turn": ends(dial(), "ends[np.abs(theta + 6 * np.pi - 1) < 1e-4] = Outcome.CRASHED"),
+    "held sensor": vehicle()._replace(sensor='interval="0.2" nsample="3"'),
+    "late sensor": vehicle()._replace(sensor='delay="0.1" nsample="4"'),
+    "short sensor": vehicle()._replace(sensor='cutoff="2"'),
+    "thin end": ends(vehicle(), "ends[np.abs(x - 1.213) < 1e-3] = Outcome.CRASHED"),
+    "thin wall": vehicle()._replace(
+        kv=1e6,
+        xml=vehicle().xml
+        | {
+            "flag": "",
+            "contact": "1",
+            "scenery": '<geom name="wall" type="box" size="0.001 3 0.2" pos="1.213 0 0"/>',
+        },
+    ),
+    "mirror": mirrored(0.05),
+    "starts": methods(
+        vehicle(),
+        "\n    def starts(self, n, rng):\n        return rng.uniform((0.0, -1.0), (0.41, 1.0), (n, 2))\n",
+    ),
+    "measurement": methods(
+        vehicle(), "\n    def measure(self, sensors):\n        return np.minimum(sensors, 2.9)\n"
+    ),
+    "outcome": methods(
+        vehicle(),
+        "\n    def outcome(self, measurement, unstable):\n        return self.ending(measurement)\n",
+    ),
+    "count": ends(
+        vehicle(),
+        "self.count = self.count + 1\n        ends[(self.count > 5) & (x > 1)] = Outcome.CRASHED",
+    ),
+    "other rows": ends(vehicle(), "ends[(x > 1) & (y >= y.max() - 0.1)] = Outcome.CRASHED"),
 }
 
 
-def drawn(seed: int, folder: Path):
-    """Writes the files of the robot of a seed, and returns its trap and its task."""
-    trap = [*TRAPS][seed % len(TRAPS)]
-    robot, name = TRAPS[trap](np.random.default_rng(seed)), f"trapped_{seed}_{next(NUMBER)}"
+def task_of(robot, folder):
+    """Writes the files of a robot, and returns its task."""
+    name = f"trapped_{next(NUMBER)}"
     actuator = FILTERED if "dyntype" in robot.servo else VELOCITY
     ahead = VELOCITY.format(name="ahead", joint="x", kv=robot.kv, more="")
     joint, ahead = ("y", ahead) if "x" in robot.py["chart"] else ("theta", "")
@@ -328,13 +240,7 @@ def drawn(seed: int, folder: Path):
     }
     (folder / f"{name}.xml").write_text(MJCF.format(**xml))
     (folder / f"{name}.py").write_text(TASK.format(name=name, **robot.py))
-    return trap, hyrl_mj.get_task(folder / f"{name}.py")
-
-
-def task_of(robot, folder, monkeypatch):
-    """The task of one robot."""
-    monkeypatch.setitem(globals(), "TRAPS", {"this": lambda rng: robot})
-    return drawn(0, folder)[1]
+    return hyrl_mj.get_task(folder / f"{name}.py")
 
 
 def policy_of(task):
@@ -388,65 +294,46 @@ def noises(task, n, rng):
 
 
 class Found(NamedTuple):
-    """What the package says of a robot.
+    """What is said of a robot, "refused", "estimate" or "proved"; and claims that a replay refutes."""
 
-    Attributes:
-        trap: its trap.
-        word: "refused", "estimate" or "proved".
-        why: why it is refused, or an estimate.
-        wrong: a sentence for each claim that a replay refutes.
-        claims: number of starts whose claims were replayed.
-    """
-
-    trap: str
     word: str
-    why: str
     wrong: tuple[str, ...]
-    claims: int
 
 
-def examined(seed: int, folder: Path) -> Found:
-    """Examines the robot of a seed, and replays what is called won of it."""
-    rng = np.random.default_rng(seed)
+def examined(robot, folder: Path) -> Found:
+    """Examines a robot, and replays what is called won of it."""
+    rng = np.random.default_rng(0)
     try:
-        trap, task = drawn(seed, folder)
+        task = task_of(robot, folder)
         check_task(task)
         policy = policy_of(task)
         grid = Grid.with_cells(task.chart, 600 if task.chart.dimension == 1 else 60)
         wrong = [*_episodes(task, policy, rng)]
-        why = Lattice.why_not(task, grid) or why_no_cells(task, grid.counts)
-        if why:
-            return Found(trap, "estimate", why, tuple(wrong), STARTS)
+        if Lattice.why_not(task, grid) or why_no_cells(task, grid.counts):
+            return Found("estimate", tuple(wrong))
         loop = PolicyController(policy)
         everywhere = GridSet.from_mask(grid, np.ones(len(grid.nodes), dtype=bool))
         parts = Partition((0, 1), (everywhere,) * 2, np.ones(len(grid.nodes), dtype=bool))
         game = Game(task, parts, {"policy": loop}, EPS, grid=grid)
         certificate = Certificate.certify(game, {"policy": loop})
-        if certificate.cells is None or "policy" not in certificate.answers:
-            why = certificate.why_not["policy"]
-            return Found(trap, "estimate", why, tuple(wrong), STARTS)
-    except BadInput as error:
-        return Found([*TRAPS][seed % len(TRAPS)], "refused", str(error), (), 0)
+    except BadInput:
+        return Found("refused", ())
+    if "policy" not in certificate.answers:
+        return Found("estimate", tuple(wrong))
     cells = certificate.cells
     proved = np.flatnonzero((certificate.value("policy", EPS)[-1, :-2] < NEVER) & cells.running)
     won = np.flatnonzero((game.value("policy", EPS)[-1, :-2] < NEVER) & game.lattice.running)
-    claims = 0
     for what, at, place in (
-        ("proved", proved, lambda k: cells.middle(k) + _inside(k, cells, rng)),
+        ("proved", proved, lambda k: cells.draw(k, rng)),
         ("won", won, lambda k: game.lattice.grid.nodes[k]),
     ):
         if len(at):
             z = place(rng.choice(at, STARTS))
-            claims += len(z)
             for noise in noises(task, len(z), rng):
                 lost = ~replay(task, policy, z, noise)
                 if lost.any():
                     wrong.append(f"{what} and lost: {lost.sum()} of {len(z)}, as {z[lost][0]}")
-    return Found(trap, "proved" if len(proved) else "nothing proved", "", tuple(wrong), claims)
-
-
-def _inside(at, cells, rng):
-    return rng.uniform(-0.5, 0.5, (len(at), len(cells.counts))) * cells.lattice.grid.spacing
+    return Found("proved" if len(proved) else "nothing proved", tuple(wrong))
 
 
 def _episodes(task, policy, rng):

@@ -234,6 +234,21 @@ def read_record(path: Path, kind: str, record: type[Record], remedy: str = REMED
     return read_json(path, kind, lambda content: parsed(content, record, remedy), remedy)
 
 
+class SavedAsJson:
+    """Base of the frozen dataclasses that are saved as a JSON file."""
+
+    KIND: ClassVar[str]
+
+    def save(self, path: Path) -> None:
+        """Writes the JSON file."""
+        write_json(path, self, self.KIND)
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Reads what `save` wrote; raises `BadArtifact` if it is missing, damaged, or of another version."""
+        return read_record(path, cls.KIND, cls)
+
+
 def parsed(content: Mapping[str, Any], record: type[Record], remedy: str = REMEDY) -> Record:
     """Returns the dataclass that nested dictionaries and lists describe.
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -21,7 +20,7 @@ JUDGED = 64
 
 
 @dataclass(frozen=True)
-class Arrivals:
+class Arrivals(artifacts.SavedAsJson):
     """From how many of its task's starts a policy arrives without noise, saved as `arrivals.json`.
 
     Attributes:
@@ -29,6 +28,8 @@ class Arrivals:
         missed: those of them that end farther from the set-point than the task's `close`.
         episodes: number of episodes.
     """
+
+    KIND: ClassVar[str] = "arrivals"
 
     arrived: int
     missed: int
@@ -48,15 +49,6 @@ class Arrivals:
         arrived = run.outcome == Outcome.REACHED
         missed = arrived & ~task.arrived(run.path[-1])
         return Arrivals(int(arrived.sum()), int(missed.sum()), len(arrived))
-
-    def save(self, path: Path) -> None:
-        """Writes `arrivals.json`."""
-        artifacts.write_json(path, self, "arrivals")
-
-    @staticmethod
-    def load(path: Path) -> Arrivals:
-        """Reads what `save` wrote; raises `BadArtifact` if it is missing, damaged, or of another version."""
-        return artifacts.read_record(path, "arrivals", Arrivals)
 
 
 def failures(task: Task, policy: Policy) -> tuple[Counter[Outcome], float | None]:
@@ -104,16 +96,9 @@ class ModeResult:
 
 
 @dataclass(frozen=True)
-class Retraining:
+class Retraining(artifacts.SavedAsJson):
     """How stage 6 ended: a result for each mode. Saved as `retraining.json`."""
 
+    KIND: ClassVar[str] = "retraining"
+
     modes: tuple[ModeResult, ...]
-
-    def save(self, path: Path) -> None:
-        """Writes `retraining.json`."""
-        artifacts.write_json(path, self, "retraining")
-
-    @staticmethod
-    def load(path: Path) -> Retraining:
-        """Reads what `save` wrote; raises `BadArtifact` if it is missing, damaged, or of another version."""
-        return artifacts.read_record(path, "retraining", Retraining)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from hyrl_mj.judging.evidence import Sample, VerdictSettings, by_kind, success_rates
-from hyrl_mj.judging.game import NEARLY, NO_NOISE, ReplayCount, Robustness, percent
+from hyrl_mj.judging.game import NEARLY, NO_NOISE, ReplayCount, Robustness, Score, percent
 from hyrl_mj.judging.results import Arrivals, Retraining
 from hyrl_mj.judging.sentences import (
     NAMES,
@@ -162,16 +162,20 @@ class _Case:
         )
 
     @property
+    def score(self) -> Score | None:
+        """What the game, if it decides, says of HyRL under the noise."""
+        game = self.robustness.deciding
+        return game.scores["hyrl"][-1] if game else None
+
+    @property
     def winnable(self) -> float:
         """The share of the starts that can be won under the noise."""
-        game = self.robustness.deciding
-        return game.scores["hyrl"][-1].winnable if game else 1.0
+        return self.score.winnable if self.score else 1.0
 
     @property
     def open(self) -> float:
         """The share of the starts that are open to one who sees the state."""
-        game = self.robustness.deciding
-        return game.scores["hyrl"][-1].open if game else 1.0
+        return self.score.open if self.score else 1.0
 
     @property
     def replays(self) -> ReplayCount | None:
@@ -199,10 +203,9 @@ class _Case:
 
     def proved(self) -> Iterator[str]:
         """Yields why the run is PROVED, if the game is to be believed."""
-        game = self.robustness.deciding
-        if not game or not self.examined or not self.winnable:
+        score = self.score
+        if not score or not self.examined or not self.winnable:
             return
-        score = game.scores["hyrl"][-1]
         if self.fair and score.proved is not None and score.proved >= NEARLY:
             own, some = score.proved * score.winnable, (score.proved_any or 0.0) * score.winnable
             sentence = (

@@ -6,7 +6,7 @@ from collections.abc import Collection
 from dataclasses import dataclass, field
 from enum import IntEnum
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -273,7 +273,7 @@ class GameResult:
 
 
 @dataclass(frozen=True)
-class Robustness:
+class Robustness(artifacts.SavedAsJson):
     """The result of an examination under noise, saved as `robustness.json`.
 
     Attributes:
@@ -285,6 +285,8 @@ class Robustness:
         attacks: counts of the attack, one for each controller, if there was one.
         comparisons: of the controllers, from the same starts, by kind of noise; that of the attack is last.
     """
+
+    KIND: ClassVar[str] = "robustness"
 
     eps: float
     everywhere: bool
@@ -328,12 +330,8 @@ class Robustness:
         episodes = sum(count.episodes for count in self.episodes)
         return f"Robustness(eps {self.eps:g}, {game}{episodes:,} episodes)"
 
-    def save(self, path: Path) -> None:
-        """Writes `robustness.json`."""
-        artifacts.write_json(path, self, "robustness")
-
-    @staticmethod
-    def load(path: Path, of: Collection[str] = ()) -> Robustness:
+    @classmethod
+    def load(cls, path: Path, of: Collection[str] = ()) -> Self:
         """Reads what `save` wrote.
 
         Args:
@@ -344,7 +342,7 @@ class Robustness:
             BadArtifact: the file is missing, damaged, of another version, or about other controllers.
         """
         remedy = "run hyrl-mj robustness RUN to write it again"
-        robustness = artifacts.read_record(path, "robustness", Robustness, remedy)
+        robustness = artifacts.read_record(path, cls.KIND, cls, remedy)
         if of:
             with artifacts.reading(path):
                 robustness.check(of)
