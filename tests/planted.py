@@ -13,6 +13,7 @@ from PIL import Image
 from hyrl_mj.files.artifacts import digest
 from hyrl_mj.files.manifest import FILES, Entry, Manifest
 from hyrl_mj.gym_import import draws, resets, starts, trials, uses
+from hyrl_mj.gym_import.instance import Instance
 from hyrl_mj.gym_import.task import EnvironmentTask
 from hyrl_mj.judging import worst_case as examination
 from hyrl_mj.judging.proof import cells, counterexamples, replays
@@ -24,7 +25,7 @@ from hyrl_mj.sets import Chart, Grid, GridSet
 from hyrl_mj.stages import grounds
 from hyrl_mj.stages.critical_set import CriticalSet
 from hyrl_mj.stages.partition import Partition
-from hyrl_mj.tasks import Learning, Outcome, Scene, Task
+from hyrl_mj.tasks import Learning, Outcome, Scene, Task, trial
 from hyrl_mj.viz import diagnosis
 from hyrl_mj.viz.figures import style
 
@@ -104,6 +105,12 @@ def few_trials(patch):
         for name in few.keys() & vars(module).keys():
             patch.setattr(module, name, few[name])
     patch.setattr(trials._runs, "__defaults__", (few["EPISODES"],))
+    wander = Instance.wander
+
+    def shorter(instance, rng, samples, held):  # the first look is the longest of fixed length
+        return wander(instance, rng, 40 if samples == 150 else samples, held)
+
+    patch.setattr(Instance, "wander", shorter)
 
 
 def coarsen(patch):
@@ -117,6 +124,8 @@ def coarsen(patch):
     starts = {"none": 60, "uniform": 60, "alternating": 60, "worst": 60, "cells": 10, "sensor": 60}
     patch.setattr(replays, "STARTS", starts)
     patch.setattr(replays, "WHOLE", 10)
+    patch.setattr(trial, "STEPS", 10_000)  # of the physics, in all episodes
+    patch.setattr(trial, "FEWEST", 4)
 
 
 def euler(task, z, u):
