@@ -47,9 +47,10 @@ class Puck(gym.Env):
         xml: its model.
         at: where its place is in MuJoCo's positions and velocities.
         draws: whether resets draw its place, or all lead to one.
+        substeps: of the physics, in a step.
     """
 
-    xml, at, draws = XML, slice(2), True
+    xml, at, draws, substeps = XML, slice(2), True, 5
     observation_space = spaces.Dict(
         {
             "velocity": spaces.Box(-np.inf, np.inf, (2,)),
@@ -85,7 +86,7 @@ class Puck(gym.Env):
 
     def step(self, action):
         self.control(np.clip(action, -4, 4))
-        mujoco.mj_step(self.model, self.data, nstep=5)
+        mujoco.mj_step(self.model, self.data, nstep=self.substeps)
         self.after()
         off = float(np.linalg.norm(self.data.qpos[self.at] - GOAL))
         return self._get_obs(), -off, self.crashed(), False, {"success": self.arrived(off)}

@@ -41,6 +41,7 @@ from hyrl_mj.physics.rendering import SceneRenderer
 from hyrl_mj.pipeline import steps
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.simulation import Recorded, closed_loop
+from hyrl_mj.stages import grounds
 from hyrl_mj.system import cores
 from hyrl_mj.tasks import check_task, described_task, reference
 from hyrl_mj.viz.replay.marks import tracked_points
@@ -486,13 +487,18 @@ def test_free_cameras_are_there_for_every_model(puck):
         camera_of(model, "chase")
 
 
+class Quick(Puck):
+    substeps = 10
+
+
 def test_an_agent_is_diagnosed_and_made_robust_in_its_own_environment(tmp_path, monkeypatch):
     spare_environments(monkeypatch)
     without_pdfs(monkeypatch)
-    monkeypatch.setitem(presets._GRIDS_DYNAMIC, 2, (16, 24))  # coarser than preset smoke
-    few = {"episodes": 12, "attack_starts": 16, "attack_rounds": 1}
+    monkeypatch.setitem(presets._GRIDS_DYNAMIC, 2, (14, 18))  # coarser than preset smoke
+    monkeypatch.setattr(grounds, "ATTACKED", 6)
+    few = {"episodes": 8, "attack_starts": 10, "attack_rounds": 1}
     monkeypatch.setattr(steps, "SPARING", replace(steps.SPARING, **few))
-    task = from_gymnasium(Puck, steps=38, bounds={"x": (-1.7, 1.8), "y": (-1.2, 1.2)})
+    task = from_gymnasium(Quick, steps=20, bounds={"x": (-1.7, 1.8), "y": (-1.2, 1.2)})
     path, said = tmp_path / "puck", []
     options = {"preset": "smoke", "eps": 0.1, "out": path, "say": said.append}
     diagnosed = hyrl_mj.diagnose(task, puck_agent, **options)
@@ -554,6 +560,7 @@ def test_an_environment_that_counts_its_steps_ends_the_episode_of_each_copy(othe
     ]
 
 
+@pytest.mark.first(3)
 @others
 def test_the_tasks_of_other_packages_are_complete(name, other):
     task = other(name)
