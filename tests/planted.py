@@ -97,8 +97,8 @@ def spare_environments(patch):
 def few_trials(patch):
     """Patches how often an environment is reset and played before it is used.
 
-    What these trials have to find is found in so few, too. That they refuse nothing which is honest is
-    tested with all of them, in `test_trapped_environments` and `test_true_environments`.
+    What these trials have to find is found in so few, too, but for what the fixture `all_trials` is for.
+    That they refuse nothing which is honest is tested with all of them, in `test_trapped_environments`.
     """
     few = {"EPISODES": 4, "SAMPLES": 16, "PLACES": 16, "RESETS": 24, "SELDOM": 80}
     for module in (trials, uses, draws, starts, resets):

@@ -1,12 +1,16 @@
 """Environments of others as tasks: plant, noise, what is found out about them, and what is refused."""
 
 import functools
+import gc
 import importlib
 import json
+import multiprocessing
 import pickle
 import re
 import sys
+import time
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import gymnasium as gym
@@ -21,6 +25,9 @@ from environments import (
     Moved,
     Puck,
     always,
+    ends,
+    outcomes,
+    plain,
     puck_agent,
 )
 from gl import needs_gl
@@ -31,7 +38,7 @@ from manual import arguments_of_environments
 from planted import spare_environments, without_pdfs
 
 import hyrl_mj
-from hyrl_mj import BadInput, Outcome, from_gymnasium, simulate
+from hyrl_mj import BadInput, Outcome, from_gymnasium, get_task, simulate
 from hyrl_mj.gym_import import making
 from hyrl_mj.gym_import.coordinates import coordinates
 from hyrl_mj.gym_import.instance import Instance, flat
@@ -263,8 +270,7 @@ class Through(Puck):
 def test_walls_that_nothing_collides_with_are_none_and_warnings_are_not_written(
     tmp_path, monkeypatch
 ):
-    spec = EnvSpec("Through-v0", entry_point=Through, max_episode_steps=20)
-    monkeypatch.setitem(gym.registry, "Through-v0", spec)
+    register(monkeypatch, "Through-v0", Through, max_episode_steps=20)
     done = command("run", "--env", "Through-v0", cwd=tmp_path)
     assert done.returncode == 2
     assert "no walls that can be passed on both sides" in done.stderr
@@ -281,6 +287,7 @@ def test_walls_that_nothing_collides_with_are_none_and_warnings_are_not_written(
         ({"bounds": {"z": (0, 1)}}, "bounds for z.*x, y"),
         ({"pinned": {"qpos[9]": 0}}, r"no qpos\[9\]"),
         ({"pinned": {"speed": 0}}, "no attribute speed"),
+        ({"pinned": {"data": 1.0}}, "no attribute data of shape"),
         ({"starts": "there"}, "unknown starts"),
         ({"kwargs": {"depth": 3}}, r"cannot be made .TypeError"),
         ({"steps": "many"}, "steps 'many' cannot be used: give an integer from 1"),
@@ -455,6 +462,133 @@ def test_a_module_of_the_current_folder_is_found_and_again_only_as_it_was(tmp_pa
     with pytest.raises(BadInput, match=r"use it once, as with .*--env beside_me:Beside-v0"):
         described_task(spec)
     del gym.registry["Beside-v0"], sys.modules["beside_me"]
+
+
+# ---- what an id, or a name, stands for
+
+
+@pytest.mark.long
+def test_of_two_functions_of_one_name_neither_is_taken_for_the_other():
+    def made(scale):
+        def make():
+            return setattr(env := Puck(), "scale", scale) or env
+
+        return make
+
+    one = from_gymnasium(made(1.0), steps=5)
+    assert get_task(one.spec) is one
+    two = from_gymnasium(made(2.0), steps=5)
+    with pytest.raises(BadInput, match="two functions are called make"):
+        get_task(one.spec)
+    one = None
+    assert get_task(two.spec) is two
+
+
+class Legs(Puck):
+    """Succeeds at the last of several goals, which options give as a list."""
+
+    def reset(self, *, seed=None, options=None):
+        self.goals = (options or {"goals": [0.0]})["goals"] * 2
+        return super().reset(seed=seed)
+
+    def arrived(self, off):
+        return off < 0.25 and len(self.goals) == 4
+
+
+class Failing(Puck):
+    def control(self, action):
+        raise ValueError("emergency stop")
+
+
+def register(monkeypatch, name, kind, **given):
+    spec = EnvSpec(name, entry_point=kind, **given)
+    monkeypatch.setitem(gym.registry, name, spec)
+
+
+@pytest.mark.long
+def test_options_of_a_reset_are_what_they_were_given_as_and_an_id_may_come_to_mean_another(
+    monkeypatch,
+):
+    assert outcomes(Legs, reset={"goals": [1.0, 2.0]}) == plain()
+    seen, given = [], {"reset": {"goals": np.array([1.0, 2.0])}}
+
+    def looked(description, untried):
+        seen.append(description)
+        raise BadInput("looked at")
+
+    register(monkeypatch, "Legs-v0", Legs, max_episode_steps=60)
+    task = from_gymnasium("Legs-v0", **given)
+    assert ends(task) != plain()
+    assert '{"array": [1.0, 2.0]}' in task.spec
+    assert from_gymnasium("Legs-v0", **given) is task
+    register(monkeypatch, "Legs-v0", Failing)
+    with pytest.raises(BadInput, match="emergency stop"):
+        from_gymnasium("Legs-v0", **given)
+    monkeypatch.setattr(making, "inspect", looked)
+    with pytest.raises(BadInput, match="looked at"):
+        get_task(task.spec)
+    assert isinstance(seen[0].reset["goals"], np.ndarray)
+
+
+class Configured(Puck):
+    """It takes its settings out of a dictionary, and its model from a file."""
+
+    def __init__(self, settings):
+        self.share, self.xml = settings.pop("share", 1.0), Path(settings["file"]).read_text()
+        super().__init__()
+
+
+@pytest.mark.long
+def test_settings_are_as_given_in_each_instance_and_a_file_that_changes_is_read_again(
+    tmp_path, monkeypatch
+):
+    file = tmp_path / "puck.xml"
+    file.write_text(XML)
+    given = {"settings": {"share": 0.5, "file": str(file)}}
+    register(monkeypatch, "Configured-v0", Configured)
+    task = from_gymnasium("Configured-v0", kwargs=given, steps=5)
+    given["settings"]["share"] = 0.1
+    assert Instance(task.specification).inner.share == 0.5
+    given["settings"]["share"] = 0.5
+    assert from_gymnasium("Configured-v0", kwargs=given, steps=5) is task
+    file.write_text(XML.replace('mass="1"', 'mass="2"'))
+    other = from_gymnasium("Configured-v0", kwargs=given, steps=5)
+    assert (task.model.body_mass[-1], other.model.body_mass[-1]) == (1, 2)
+
+
+@pytest.mark.long
+def test_code_that_is_imported_again_is_another_environment(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    path = tmp_path / "changing.py"
+    text = (
+        "import gymnasium as gym\nfrom environments import Puck\n\n\nclass Changing(Puck):\n"
+        "    def arrived(self, off):\n        return off < 0.25\n\n\n"
+        "gym.register('Changing-v0', 'changing:Changing', max_episode_steps=60)\n"
+    )
+    path.write_text(text)
+    before = from_gymnasium("changing:Changing-v0", steps=5)
+    assert from_gymnasium("changing:Changing-v0", steps=5) is before
+    path.write_text(text.replace("off < 0.25", "1 / 0"))
+    importlib.invalidate_caches()
+    importlib.reload(sys.modules["changing"])
+    with pytest.raises(BadInput, match="ZeroDivisionError"):
+        from_gymnasium("changing:Changing-v0", steps=5)
+    del gym.registry["Changing-v0"], sys.modules["changing"]
+
+
+def test_processes_of_a_task_that_nobody_has_end():
+    before = {*multiprocessing.active_children()}
+    tasks = [from_gymnasium(Puck, steps=2, seed=seed) for seed in range(2)]
+    made = {*multiprocessing.active_children()} - before
+    assert len(made) >= 2
+    del tasks
+    making._RECENT.clear()
+    gc.collect()
+    until = time.monotonic() + 10
+    while made & {*multiprocessing.active_children()} and time.monotonic() < until:
+        time.sleep(0.05)
+    assert not made & {*multiprocessing.active_children()}
 
 
 @needs_gl

@@ -1,8 +1,11 @@
 """Environments that mislead in what they step, draw, observe, keep or tell are refused by name."""
 
+import array
 import itertools
 import random
+import re
 import sys
+import threading
 import time
 from functools import partial
 
@@ -16,6 +19,12 @@ from gymnasium import spaces
 from gymnasium.wrappers import NormalizeObservation, TimeLimit
 
 from hyrl_mj import BadInput, from_gymnasium
+from hyrl_mj.gym_import import inspection
+from hyrl_mj.gym_import.fingerprint import Unknown, fingerprint, is_known
+from hyrl_mj.gym_import.instance import Instance
+from hyrl_mj.gym_import.opening import Description
+from hyrl_mj.gym_import.specification import EnvironmentSpec
+from hyrl_mj.system.generators import global_state, kept_generators
 
 pytestmark = pytest.mark.slow  # a second for each environment
 long = pytest.mark.long
@@ -225,7 +234,7 @@ STEPS = {
 # ---- what is observed
 
 
-class Unknown(Puck):
+class Unseen(Puck):
     """No method that is known by its name computes what it observes."""
 
     def what_is_seen(self):
@@ -483,7 +492,7 @@ class Chasing(Rigged):
 
 FOLLOWS, COPIES = "does not follow its state", "observes shows {}.*, to which code copies the place"
 OBSERVED = {
-    "by no known method": (Unknown, "no method that computes what it observes"),
+    "by no known method": (Unseen, "no method that computes what it observes"),
     "infinite": (Infinite, "Infinite observes -?(inf|nan) in observation"),
     "0 / 0": (Beginning, r"Beginning observes nan in observation\[\d\]"),
     "stale": (Stale, r"of Stale returns observation\[0\] of another place .* mj_forward before it"),
@@ -837,3 +846,102 @@ def test_what_misleads_in_some_runs_only_is_refused_there(name):
     more = {"steps": 140, "starts": MANY} if noise is None else {}
     with pytest.raises(BadInput, match=message):
         outcomes(kind(), noise or 0.0, **more)
+
+
+# ---- what is remembered
+
+
+def fingers(env):
+    return fingerprint(env, env.model, env.data)
+
+
+class Alarmed(Puck):
+    """Remembers in an event of `threading` whether it has been near the right wall."""
+
+    def __init__(self):
+        super().__init__()
+        self.alarm = threading.Event()
+
+    def after(self):
+        if self.data.qpos[0] > 0.9:
+            self.alarm.set()
+
+
+class Cameras(Puck):
+    """Remembers in a camera of its model how often it has been stepped, or in numbers of its user."""
+
+    xml = XML.replace("<worldbody>", '<size nuser_geom="1"/><worldbody><camera name="eye"/>')
+    part = "cam_fovy"
+
+    def after(self):
+        getattr(self.model, self.part).flat[0] += 1e-3
+
+
+class Users(Cameras):
+    part = "geom_user"
+
+
+class Row(array.array):
+    """Has attributes, and keeps numbers in C beside them."""
+
+
+class Rows(Puck):
+    def __init__(self):
+        super().__init__()
+        self.kept = Row("d", [1.0])
+        self.kept.name = "row"
+
+    def after(self):
+        self.kept[0] = 2.0
+
+
+@pytest.mark.parametrize("make", [Alarmed, Cameras, Users, Rows])
+def test_what_is_no_plain_attribute_is_remembered_too(make):
+    env = make()
+    env.reset(seed=0)
+    env.data.qpos[:] = 1.0, 0.5
+    before = fingers(env)
+    env.after()
+    assert fingers(env) != before
+
+
+def test_what_cannot_be_written_down_is_compared_as_an_object():
+    env = Puck()
+    env.rows = (number for number in range(3))
+    before = fingers(env)
+    assert isinstance(before["rows"], Unknown)
+    assert before == fingers(env)
+    env.rows = (number for number in range(3))
+    assert before != fingers(env)
+    assert Unknown() != Unknown()
+    env.rows = type("Lock", (threading.local,), {})()
+    assert not is_known(fingers(env))
+
+
+def test_any_number_of_random_numbers_is_noticed():
+    """Also as many as fill the table of the generator, after which its place is the same."""
+    with kept_generators():
+        np.random.seed(0)
+        for count in (1, 312, 624):
+            before = global_state()
+            np.random.random(count)
+            assert global_state() != before
+
+
+@long
+def test_generators_that_nobody_draws_from_are_like_any_memory():
+    makes = [make for name, (make, _) in SOURCES.items() if name != "system"]
+    values = {"make": lambda self: [make(self) for make in makes], "draw": lambda *_: None}
+    found = from_gymnasium(type("Holding", (Drawing,), values), steps=20).specification
+    assert found.memoryless
+    assert "episodes" not in found.found
+
+
+def test_a_slow_environment_is_said_to_take_minutes(caplog):
+    slow = type("Slow", (Puck,), {"after": lambda self: time.sleep(0.03)})
+    for kind in (Puck, slow):
+        inspection._check_times(Instance(EnvironmentSpec(Description(kind))))
+    assert [re.sub(r"\d+", "N", text) for text in caplog.messages] == [
+        "Slow takes N ms for a reset and N ms for a step: to look at it, before anything else, takes about N "
+        "minute(s)"
+    ]

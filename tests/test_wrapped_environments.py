@@ -1,6 +1,7 @@
 """Wrappers, noise and ends: episodes are played as the environment plays them, or it is refused by name."""
 
 import copy
+import sys
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
@@ -415,14 +416,22 @@ def test_attributes_that_change_belong_to_each_run_and_a_time_limit_below_a_wrap
 
 
 @pytest.mark.long
-def test_loaded_statistics_are_kept_and_what_an_environment_shares_of_rewards_is_taken():
+def test_loaded_statistics_and_what_is_shared_of_rewards_are_taken_and_a_count_is_said():
     def normalised():
         env = NormalizeObservation(Flat())
         env.obs_rms.mean, env.update_running_mean = env.obs_rms.mean + 0.1, False
         return env
 
+    class Counting(Flat):
+        episodes = 0
+
+        def begin(self, place):
+            self.episodes += 1
+
     for make in (normalised, lambda: NormalizeReward(Flat())):
         assert from_gymnasium(make, steps=20).max_steps == 20
+    found = from_gymnasium(Counting, steps=20).found
+    assert "because of what outlasts resets (episodes)" in found["episodes"]
 
 
 # ---- ends of episodes
@@ -507,7 +516,7 @@ def test_an_end_at_the_goal_is_an_arrival_and_a_collision_is_none(make, success)
     ("make", "given", "message"),
     [
         (Colliding, {"success": "terminated"}, "touches what it does not touch elsewhere"),
-        (Puck, {"success": 'info["won"]'}, "no method of it has that word: name an entry of info; it"),
+        (Puck, {"success": 'info["won"]'}, "that word: name an entry of info; it has had success"),
         (Puck, {"failure": 'info["success"]'}, "it is a success .* and a failure"),
         (
             lambda: RecordEpisodeStatistics(Puck()), {"success": 'info["episode"]["r"] > 0'},
@@ -520,9 +529,17 @@ def test_conditions_that_mislead_are_refused(make, given, message):
         from_gymnasium(make, **given)
 
 
-def test_a_run_that_begins_in_a_wall_is_over():
-    arc = simulate(flat_task(), always(flat_task(), 0, 0), [0.0, 0.0])
+def test_a_run_that_begins_in_a_wall_is_over_and_so_is_one_that_has_arrived():
+    task = flat_task()
+    arc = simulate(task, always(task, 0, 0), [0.0, 0.0])
     assert (arc.outcome, len(arc.t)) == ("crashed", 1)
+    # The rock ends at x = -0.3, and the puck is 0.1 m wide: it may touch no deeper than runs do.
+    assert task.goes_on(np.array([[-0.41, 0.0], [-0.36, 0.0]])).tolist() == [True, False]
+    plant = task.plant(1)
+    plant.set_state(*task.state(np.array([[1.2, 0.0]])))
+    for _ in range(6):  # nobody looks at it
+        plant.step(np.array([[4.0, 0.0]]))
+    assert plant.measurement[0, -1] == 1
 
 
 # ---- what runs remember, and see
@@ -569,6 +586,7 @@ def test_what_a_run_remembers_or_recalls_is_its_own():
     np.testing.assert_allclose(observed[:, 4:], [[1.0, 2.0, 0.0], [3.0, -1.0, 0.0]])
     np.testing.assert_allclose(observed[:, :2], plant.qpos + 0.05)
     assert key.specification.recalled.tolist() == [False] * 4 + [True] * 3
+    assert not key.abilities.restarts
 
 
 class Observing(Puck):
@@ -701,3 +719,14 @@ def test_what_lags_by_a_physics_step_is_moved_by_noise_where_the_robot_was_then(
     seen = slice(-3 - 2, -3)  # before reward, success and outcome
     assert not np.allclose(true[seen], true[:2], rtol=0, atol=1e-4)  # it moves
     np.testing.assert_allclose(alike[seen] - true[seen], noise[1, :2], rtol=0, atol=1e-12)
+
+
+@pytest.mark.long
+def test_variables_of_a_script_are_not_those_of_its_environment(monkeypatch):
+    script = type(sys)("a_script")
+    monkeypatch.setitem(sys.modules, "a_script", script)
+    script.results = []
+    task = from_gymnasium(type("Scripted", (Flat,), {"__module__": "a_script"}), steps=60)
+    for _ in range(2):
+        script.results.append(ends(task, starts=STARTS[:1]))
+    assert script.results == [plain()[:1]] * 2
