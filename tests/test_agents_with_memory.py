@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from planted import sign_policy
+from planted import sign_policy, spare
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.vec_env import VecNormalize
 from trapped import HONEST, TRAPS
@@ -587,7 +587,8 @@ def test_python_code_is_named_by_its_module_and_object(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_diagnosis_says_so_and_goes_on(small_runs, circle, tmp_path):
+def test_a_diagnosis_says_so_and_goes_on(small_runs, circle, tmp_path, monkeypatch):
+    spare(monkeypatch, episodes=12, batches=1, attack_starts=12, attack_rounds=1)
     said, out = [], tmp_path / "run"
     run = hyrl_mj.diagnose("unit_circle", Chunked(), preset="smoke", out=out, say=said.append)
     assert any("it has a memory: noisy episodes stand in for the worst" in line for line in said)

@@ -152,7 +152,7 @@ def as_there(model, wrapped, task, measured):
     [
         *((DQN, "vehicle", wrapped) for wrapped in WRAPPED),
         (PPO, "unit_circle", "normalised, stacked"),
-        (SAC, "rover", "stacked, normalised"),
+        (SAC, "unit_circle", "stacked, normalised"),
     ],
 )
 def test_in_a_closed_loop_it_acts_as_under_sb3(algorithm, name, wrapped, tmp_path):
