@@ -155,6 +155,16 @@ def small_runs():
         yield
 
 
+@pytest.fixture(scope="module")
+def few_steps():
+    """While the tests of a file run, tasks are tried out for a shorter time."""
+    from planted import few_steps
+
+    with pytest.MonkeyPatch.context() as patch:
+        few_steps(patch)
+        yield
+
+
 @pytest.fixture(scope="session", autouse=True)
 def few_trials():
     """Environments are looked at for a shorter time."""

@@ -113,6 +113,12 @@ def few_trials(patch):
     patch.setattr(Instance, "wander", shorter)
 
 
+def few_steps(patch):
+    """Patches for how long a task is tried out before it is used."""
+    patch.setattr(trial, "STEPS", 10_000)  # of the physics, in all episodes
+    patch.setattr(trial, "FEWEST", 4)
+
+
 def coarsen(patch):
     """Patches what is shown and played: few pixels, few frames, a simple font, few replays of proofs."""
     patch.setattr(examination, "CURVE", examination.CURVE[::4])
@@ -124,8 +130,6 @@ def coarsen(patch):
     starts = {"none": 60, "uniform": 60, "alternating": 60, "worst": 60, "cells": 10, "sensor": 60}
     patch.setattr(replays, "STARTS", starts)
     patch.setattr(replays, "WHOLE", 10)
-    patch.setattr(trial, "STEPS", 10_000)  # of the physics, in all episodes
-    patch.setattr(trial, "FEWEST", 4)
 
 
 def euler(task, z, u):

@@ -53,7 +53,8 @@ from hyrl_mj.system import cores
 from hyrl_mj.tasks import check_task, described_task, reference
 from hyrl_mj.viz.replay.marks import tracked_points
 
-pytestmark = pytest.mark.slow  # a second for each environment
+# A second for each environment.
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_steps")]
 
 # What the environments of other packages need, beside their ids; episodes are short.
 OTHERS = {name: {**given, "steps": 60} for name, given in arguments_of_environments().items()}
