@@ -169,26 +169,39 @@ def small_runs():
 
 
 @pytest.fixture(scope="module")
+def few_steps():
+    """While the tests of a file run, tasks are tried out for a shorter time."""
+    from planted import few_steps
+
+    with pytest.MonkeyPatch.context() as patch:
+        few_steps(patch)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
 def few_trials():
-    """While the tests of a file run, environments are looked at for a shorter time."""
+    """Environments are looked at for a shorter time."""
     from planted import few_trials
 
     with pytest.MonkeyPatch.context() as patch:
         few_trials(patch)
-        yield
+        yield patch
+
+
+@pytest.fixture
+def all_trials(few_trials):
+    """In a test environments are looked at for as long as users' are."""
+    from planted import few_trials as shorten_trials
+
+    few_trials.undo()
+    yield
+    shorten_trials(few_trials)
 
 
 # The files that take longest, in this order, each more than half a minute.
-LONGEST = ("docs", "demo", "attack", "environments", "trapped_environments", "true_environments")
-LONGEST += (
-    "truer_environments",
-    "wrapped_environments",
-    "robustify",
-    "sweep",
-    "retraining",
-    "algorithms",
-)
-LONGEST += ("surroundings", "cli", "report", "training", "tables", "doors")
+LONGEST = ("docs", "demo", "attack", "environments", "wrapped_environments", "refused_environments")
+LONGEST += ("starts_of_environments", "trapped_environments", "robustify", "sweep", "retraining")
+LONGEST += ("algorithms", "surroundings", "cli", "report", "training", "tables", "doors")
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -13,6 +13,7 @@ from PIL import Image
 from hyrl_mj.files.artifacts import digest
 from hyrl_mj.files.manifest import FILES, Entry, Manifest
 from hyrl_mj.gym_import import draws, resets, starts, trials, uses
+from hyrl_mj.gym_import.instance import Instance
 from hyrl_mj.gym_import.task import EnvironmentTask
 from hyrl_mj.judging import worst_case as examination
 from hyrl_mj.judging.proof import cells, counterexamples, replays
@@ -24,7 +25,7 @@ from hyrl_mj.sets import Chart, Grid, GridSet
 from hyrl_mj.stages import grounds
 from hyrl_mj.stages.critical_set import CriticalSet
 from hyrl_mj.stages.partition import Partition
-from hyrl_mj.tasks import Learning, Outcome, Scene, Task
+from hyrl_mj.tasks import Learning, Outcome, Scene, Task, trial
 from hyrl_mj.viz import diagnosis
 from hyrl_mj.viz.figures import style
 
@@ -96,14 +97,26 @@ def spare_environments(patch):
 def few_trials(patch):
     """Patches how often an environment is reset and played before it is used.
 
-    What these trials have to find is found in so few, too. That they refuse nothing which is honest is
-    tested with all of them, in `test_trapped_environments` and `test_true_environments`.
+    What these trials have to find is found in so few, too, but for what the fixture `all_trials` is for.
+    That they refuse nothing which is honest is tested with all of them, in `test_trapped_environments`.
     """
     few = {"EPISODES": 4, "SAMPLES": 16, "PLACES": 16, "RESETS": 24, "SELDOM": 80}
     for module in (trials, uses, draws, starts, resets):
         for name in few.keys() & vars(module).keys():
             patch.setattr(module, name, few[name])
     patch.setattr(trials._runs, "__defaults__", (few["EPISODES"],))
+    wander = Instance.wander
+
+    def shorter(instance, rng, samples, held):  # the first look is the longest of fixed length
+        return wander(instance, rng, 40 if samples == 150 else samples, held)
+
+    patch.setattr(Instance, "wander", shorter)
+
+
+def few_steps(patch):
+    """Patches for how long a task is tried out before it is used."""
+    patch.setattr(trial, "STEPS", 10_000)  # of the physics, in all episodes
+    patch.setattr(trial, "FEWEST", 4)
 
 
 def coarsen(patch):

@@ -13,6 +13,8 @@ import pytest
 import torch
 from planted import random_states
 from stable_baselines3 import A2C, DDPG, DQN, PPO, SAC, TD3
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 
 import hyrl_mj
@@ -156,6 +158,23 @@ def test_a_policy_that_takes_observations_by_its_name_is_refused(vehicle):
             BadInput, match=r"act\(observations\) .*from_callable\(agent\.act, task\)"
         ):
             use(vehicle, Steers())
+
+
+class Mirrored(ActorCriticPolicy):
+    def get_distribution(self, obs):
+        return super().get_distribution(-obs)
+
+
+class Halved(SACPolicy):
+    def _predict(self, observation, deterministic=False):
+        return super()._predict(0.5 * observation, deterministic)
+
+
+@pytest.mark.parametrize(("algorithm", "policy"), [(PPO, Mirrored), (SAC, Halved)])
+def test_a_policy_class_of_one_s_own_is_refused(algorithm, policy, circle, tmp_path):
+    model = algorithm(policy, TaskVecEnv(BatchedEnv(circle, 1)), device="cpu")
+    with pytest.raises(BadInput, match="its policy is of a class of its own"):
+        load_agent(saved(model, tmp_path), circle)
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)

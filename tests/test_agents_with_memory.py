@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from planted import sign_policy
+from planted import sign_policy, spare
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.vec_env import VecNormalize
 from trapped import HONEST, TRAPS
@@ -137,8 +137,8 @@ def test_a_function_with_a_buffer_of_its_own_is_taken(circle):
 @pytest.mark.parametrize("kind", HONEST)
 def test_honest_agents_are_taken(kind):
     torch.set_num_threads(1)
-    for seed in range(4):
-        task = hyrl_mj.get_task(TASKS[seed % 2])
+    for seed, name in enumerate(TASKS):
+        task = hyrl_mj.get_task(name)
         agent = HONEST[kind](task, np.random.default_rng(seed))
         given = read_agent(task, agent)
         z0 = task.starts(10, np.random.default_rng(seed))
@@ -148,7 +148,7 @@ def test_honest_agents_are_taken(kind):
 @pytest.mark.slow
 def test_two_traps_at_once_are_noticed_as_well(vehicle):
     torch.set_num_threads(1)
-    for seed in range(12):
+    for seed in range(6):
         rng = np.random.default_rng(seed)
         agent = steering(vehicle)
         for trap in rng.choice(list(TRAPS), 2, replace=False):
@@ -240,8 +240,16 @@ def as_alone(task, plain, measured):
     return np.array(list(plain(task.observation(measured).astype(np.float32))))[:, None]
 
 
-@pytest.mark.parametrize("kind", AGENTS)
-@pytest.mark.parametrize("noise", ["none", "uniform", "adversarial"])
+@pytest.mark.parametrize(
+    ("kind", "noise"),
+    [
+        ("chunked", "uniform"),
+        ("filtered", "uniform"),
+        ("recurrent", "uniform"),
+        ("chunked", "none"),
+        ("recurrent", "adversarial"),
+    ],
+)
 def test_it_closes_a_loop_as_it_does_alone(kind, noise, puck):
     """Under noise that looks ahead, too, which asks the controller often."""
     make, plain = AGENTS[kind]
@@ -579,7 +587,8 @@ def test_python_code_is_named_by_its_module_and_object(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_diagnosis_says_so_and_goes_on(small_runs, circle, tmp_path):
+def test_a_diagnosis_says_so_and_goes_on(small_runs, circle, tmp_path, monkeypatch):
+    spare(monkeypatch, episodes=12, batches=1, attack_starts=12, attack_rounds=1)
     said, out = [], tmp_path / "run"
     run = hyrl_mj.diagnose("unit_circle", Chunked(), preset="smoke", out=out, say=said.append)
     assert any("it has a memory: noisy episodes stand in for the worst" in line for line in said)

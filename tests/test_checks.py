@@ -17,6 +17,7 @@ from hyrl_mj.simulation import LoopSettings, closed_loop
 from hyrl_mj.tasks import SPARING, check_task, trial
 from hyrl_mj.tasks.scaffold import write_task
 
+pytestmark = pytest.mark.usefixtures("few_steps")
 PY, XML = "py", "xml"
 NUMBER = itertools.count()
 

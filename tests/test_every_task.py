@@ -10,6 +10,8 @@ from hyrl_mj import Outcome
 from hyrl_mj.physics import mjcf
 from hyrl_mj.task_tests import *  # noqa: F403
 
+pytestmark = pytest.mark.usefixtures("few_steps")
+
 
 @pytest.fixture(scope="session", params=hyrl_mj.task_names())
 def task(request):

@@ -147,14 +147,16 @@ def as_there(model, wrapped, task, measured):
     return np.array(answers)
 
 
-@pytest.mark.parametrize("wrapped", WRAPPED)
 @pytest.mark.parametrize(
-    ("algorithm", "name"), [(PPO, "unit_circle"), (SAC, "rover"), (DQN, "vehicle")]
+    ("algorithm", "name", "wrapped"),
+    [
+        *((DQN, "vehicle", wrapped) for wrapped in WRAPPED),
+        (PPO, "unit_circle", "normalised, stacked"),
+        (SAC, "unit_circle", "stacked, normalised"),
+    ],
 )
 def test_in_a_closed_loop_it_acts_as_under_sb3(algorithm, name, wrapped, tmp_path):
     task = hyrl_mj.get_task(name)
-    if task.input_levels is not None and algorithm is SAC:
-        algorithm = DQN
     model, path, needs = agent(algorithm, task, tmp_path, WRAPPED[wrapped])
     policy = load_agent(path, task, **needs)
     for kind in ("none", "uniform"):

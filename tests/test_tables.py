@@ -62,11 +62,12 @@ def extended(grid, *masks, noise=EPS):
 
 @pytest.fixture(scope="module")
 def held(puck):
-    """Mode 0 passes on the upper side of the rock, mode 1 on any."""
+    """Mode 0 passes on the upper side of the rock, mode 1 on any, mode 2 beside one column of nodes."""
     grid = Grid.with_cells(puck.chart, 24)
     x, y = grid.nodes.T
+    beside = np.abs(x - np.unique(x)[5]) > 1e-9
     return HeldInputs.from_sets(
-        puck, extended(grid, (y > -0.3) | (x > 0.6), np.ones(grid.size, dtype=bool))
+        puck, extended(grid, (y > -0.3) | (x > 0.6), np.ones(grid.size, dtype=bool), beside)
     )
 
 
@@ -121,17 +122,16 @@ def test_how_far_arrival_is_under_noise_is_found_as_by_one_node_after_another(he
         assert found[i] == pytest.approx(expected)
 
 
-def test_a_held_input_leaves_the_set_if_it_does_after_some_sample(puck):
+def test_a_held_input_leaves_the_set_if_it_does_after_some_sample(held):
     """A strip that the robot jumps over in the time for which an input is held is not passed."""
-    grid = Grid.with_cells(puck.chart, 24)
+    grid = held.grid
     column = np.unique(grid.nodes[:, 0])[5]
-    held = HeldInputs.from_sets(puck, extended(grid, np.abs(grid.nodes[:, 0] - column) > 1e-9))
     starts, ends = grid.nodes[held.rows][:, 0], held.ends[..., 0]
     over = (starts < column) & (ends > column + 0.6 * grid.spacing[0])
     assert over.any()
-    assert held.leaves[0][over].all()
+    assert held.leaves[2][over].all()
     before = (starts < column) & (ends < column - grid.spacing[0])
-    assert not held.leaves[0][before].any()
+    assert not held.leaves[2][before].any()
 
 
 class Corner(Signal):

@@ -69,18 +69,18 @@ def test_two_traps_in_one_environment_are_accepted_and_right(pair):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("i", later(range(len(HONEST))))
-def test_honest_environments_are_accepted_and_right(i):
+def test_honest_environments_are_accepted_and_right(i, all_trials):
     assert not tried(honest(i))
 
 
 @pytest.mark.first(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(("kinds", "plants"), [(kinds, plants) for kinds, *plants in TOGETHER])
-def test_whatever_is_honest_is_accepted_and_right_together(kinds, plants):
+def test_whatever_is_honest_is_accepted_and_right_together(kinds, plants, all_trials):
     assert not tried(together(kinds, *plants))
 
 
-# ---- traps and judge themselves
+# ---- traps and judge themselves, which only the long lane tries
 
 
 def runs_of(case, env=None):
@@ -107,6 +107,7 @@ def alone(name):
     return [case for case in cases if not isinstance(case.factory(), gym.Wrapper)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [name for name in TRAPS if name not in (*LATER, *HARMLESS)])
 def test_traps_change_what_happens(name):
     def is_changed(case):
@@ -119,6 +120,7 @@ def test_traps_change_what_happens(name):
     assert any(is_changed(case) for case in alone(name))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", LATER)
 def test_some_traps_change_the_next_episode(name):
     def is_changed(case):
@@ -128,12 +130,13 @@ def test_some_traps_change_the_next_episode(name):
     assert any(is_changed(case) for case in alone(name))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("i", range(3))
 def test_the_truth_is_the_same_each_time(i):
     assert not differ(runs_of(honest(i)), runs_of(honest(i)))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_judge_notices_any_difference():
     case = honest(0)
     task = hyrl_mj.from_gymnasium(case.factory, **case.given)

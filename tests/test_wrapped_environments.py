@@ -1,111 +1,103 @@
-"""Wrapped environments, slow sensors, conditions and agents of users: as they are, or refused by name."""
+"""Wrappers, noise and ends: episodes are played as the environment plays them, or it is refused by name."""
 
-import functools
-import importlib
+import copy
 import sys
-from collections import deque
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 import pytest
-from environments import GOAL, Puck
-from gymnasium import spaces
-from gymnasium.wrappers import DtypeObservation, TimeLimit
-from stable_baselines3 import PPO, SAC
-from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.sac.policies import SACPolicy
-from test_truer_environments import STARTS, ends, flat, outcomes, pilot, plain
+from environments import (
+    GOAL,
+    STARTS,
+    XML,
+    Delayed,
+    Flat,
+    Puck,
+    always,
+    ends,
+    flat_task,
+    numbers,
+    outcomes,
+    pilot,
+    plain,
+)  # fmt: skip
+from gymnasium.wrappers import (
+    ClipAction,
+    DelayObservation,
+    DtypeObservation,
+    FlattenObservation,
+    FrameStackObservation,
+    NormalizeObservation,
+    NormalizeReward,
+    RecordEpisodeStatistics,
+    TimeLimit,
+)
 
-from hyrl_mj import BadInput, Noise, from_callable, from_gymnasium, load_agent, simulate
-from hyrl_mj.gym_export import BatchedEnv
-from hyrl_mj.gym_export.sb3_env import TaskVecEnv
-from hyrl_mj.tasks import check_task, trial
+from hyrl_mj import BadInput, Noise, closed_loop, from_callable, from_gymnasium, simulate
+from hyrl_mj.policies import PolicyController
+from hyrl_mj.simulation import LoopSettings, Programmes, Recorded, Rules
 
-# A second for each environment.
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_trials")]
-NARROW = spaces.Box(-np.inf, np.inf, (6,), dtype=np.float64)
-
-
-class Flat(Puck):
-    """A puck that observes a vector, as the pilot takes it, and begins anywhere or at home."""
-
-    observation_space = NARROW
-
-    def _get_obs(self):
-        place, velocity = self.seen(), self.data.qvel
-        return np.concatenate([place, GOAL - place, velocity])
-
-    def seen(self):
-        return self.data.qpos.copy()
-
-
-class Home(Flat):
-    """Each of its resets leads to one place."""
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.data.qpos[:] = -1.4, 0.1
-        self.begin()
-        return self._get_obs(), {}
-
-    def step(self, action):
-        found = super().step(action)
-        self.after()
-        return (self._get_obs(), *found[1:])
-
-    def begin(self):
-        pass
-
-    def after(self):
-        pass
-
-
-def test_a_step_ends_runs_that_nobody_has_looked_at(monkeypatch):
-    monkeypatch.setattr(trial, "STEPS", 5_000)  # of the physics, in all episodes
-    monkeypatch.setattr(trial, "FEWEST", 4)
-    task = flat()
-    assert check_task(task) is task
-    plant = task.plant(1)
-    plant.set_state(*task.state(np.array([[1.2, 0.0]])))
-    for _ in range(6):
-        plant.step(np.array([[4.0, 0.0]]))
-    assert plant.measurement[0, -1] == 1
-
+pytestmark = pytest.mark.slow  # a second for each environment
 
 # ---- ways on which noise does not come
 
 
 class Telling(Flat):
-    """Tells its place in info and in an attribute, and does not observe it itself."""
+    """Does not observe its place, and tells something of it in info or in an attribute."""
+
+    tells = ""
 
     def _get_obs(self):
         return np.concatenate([np.zeros(2), GOAL - self.seen(), self.data.qvel])
 
+    def begin(self, place):
+        self.keep(place)
+
     def step(self, action):
-        observation, reward, terminated, truncated, info = super().step(action)
-        self.pose = self.seen()
-        return observation, reward, terminated, truncated, info | {"x": float(self.pose[0])}
+        *found, info = super().step(action)
+        place = self.seen()
+        self.keep(place)
+        told = {
+            "x": float(place[0]),
+            "side": "left" if place[1] > 0 else "right",
+            "bodies": [{"name": "puck", "at": place}],
+        }
+        return *found, info | {name: told[name] for name in told if name == self.tells}
+
+    def keep(self, place):
+        kept = {
+            "pose": place,
+            "above": bool(place[1] > 0),
+            "robot": SimpleNamespace(place=place),
+            "slotted": Pose(place),
+        }
+        vars(self).update({name: kept[name] for name in kept if name == self.tells})
 
 
-class ByInfo(gym.Wrapper):
+@dataclass(slots=True)
+class Pose:
+    """Has slots in place of a dictionary."""
+
+    place: np.ndarray
+
+
+class By(gym.Wrapper):
+    """Shows in place of the first numbers of an observation what else a step tells."""
+
+    def __init__(self, env, look):
+        super().__init__(env)
+        self.look = look
+
     def step(self, action):
         observation, *rest = self.env.step(action)
-        return np.append(rest[-1].get("x", -1.4), observation[1:]), *rest
+        told = np.ravel(self.look(self, *rest))
+        return np.append(told, observation[len(told) :]), *rest
 
 
-class ByAttribute(gym.Wrapper):
-    def step(self, action):
-        observation, *rest = self.env.step(action)
-        return np.append(self.unwrapped.pose, observation[2:]), *rest
-
-
-class ByReward(gym.Wrapper):
-    def step(self, action):
-        observation, reward, *rest = self.env.step(action)
-        return np.append(reward, observation[1:]), reward, *rest
-
-
-class ByLastInfo(ByInfo):
+class ByLastInfo(gym.Wrapper):
     """Shows what it was told a sample before."""
 
     def reset(self, **options):
@@ -118,61 +110,6 @@ class ByLastInfo(ByInfo):
         return np.append(before, observation[1:]), *rest
 
 
-class Zoned(Flat):
-    """Tells words and truths, which no small displacement changes."""
-
-    def step(self, action):
-        *found, info = super().step(action)
-        self.above = bool(self.data.qpos[1] > 0)
-        return *found, info | {"side": "left" if self.above else "right"}
-
-
-class ByWord(gym.Wrapper):
-    def step(self, action):
-        observation, *rest = self.env.step(action)
-        return np.append(rest[-1].get("side") == "left", observation[1:]), *rest
-
-
-class ByTruth(gym.Wrapper):
-    def step(self, action):
-        observation, *rest = self.env.step(action)
-        return np.append(self.unwrapped.above, observation[1:]), *rest
-
-
-class Usual(Flat):
-    """Has attributes of any kind, an array for a reward, and None for `truncated`."""
-
-    walls = [[1, 2], [3]]
-
-    def __init__(self):
-        super().__init__()
-        self.rooms, self.rows = [[1, 2], [3]], iter([1])
-
-    def step(self, action):
-        observation, reward, terminated, _, info = super().step(action)
-        return observation, np.array([reward]), terminated, None, info
-
-
-def test_usual_habits_and_attributes_of_any_kind_are_taken():
-    assert outcomes(lambda: DtypeObservation(Usual(), np.float64)) == plain()
-
-
-@pytest.mark.parametrize(
-    ("wrapper", "env", "way"),
-    [
-        (ByInfo, Telling, "info x"),
-        (ByAttribute, Telling, "attribute pose"),
-        (ByLastInfo, Telling, "info x"),
-        (ByReward, Flat, "the reward"),
-        (ByWord, Zoned, "info side"),
-        (ByTruth, Zoned, "attribute above"),
-    ],
-)
-def test_wrappers_that_observe_the_place_past_the_noise_are_refused(wrapper, env, way):
-    with pytest.raises(BadInput, match=f"a wrapper of .* observes .*{way}.* does not reach"):
-        from_gymnasium(lambda: wrapper(env()))
-
-
 class Before(gym.Wrapper):
     """Shows where the robot was before the step."""
 
@@ -180,6 +117,50 @@ class Before(gym.Wrapper):
         before = self.unwrapped.data.qpos.copy()
         observation, *rest = self.env.step(action)
         return np.append(before, observation[2:]), *rest
+
+
+class Copying(gym.Wrapper):
+    def step(self, action):
+        copy.deepcopy(self.env)
+        return self.env.step(action)
+
+
+def telling(what):
+    return type("Telling", (Telling,), {"tells": what})()
+
+
+def by(what, look):
+    return lambda: By(telling(what), look)
+
+
+PAST = "a wrapper of .* observes .*{}.* does not reach"
+HELD = "a wrapper of .* observes .*{}.*, which follows the place"
+REFUSED = {
+    "info": (by("x", lambda env, *rest: rest[-1].get("x", -1.4)), PAST.format("info x")),
+    "the last info": (lambda: ByLastInfo(telling("x")), PAST.format("info x")),
+    "a word": (by("side", lambda env, *rest: rest[-1]["side"] == "left"), PAST.format("info side")),
+    "an entry of a list": (
+        by("bodies", lambda env, *rest: rest[-1]["bodies"][0]["at"]), HELD.format(r"info bodies\.0\.at"),
+    ),
+    "an attribute": (by("pose", lambda env, *_: env.unwrapped.pose), PAST.format("attribute pose")),
+    "a truth": (by("above", lambda env, *_: env.unwrapped.above), PAST.format("attribute above")),
+    "an object": (
+        by("robot", lambda env, *_: env.unwrapped.robot.place), HELD.format(r"attribute robot\.place"),
+    ),
+    "slots": (
+        by("slotted", lambda env, *_: env.unwrapped.slotted.place), HELD.format(r"attribute slotted\.place"),
+    ),
+    "the reward": (lambda: By(Flat(), lambda env, reward, *_: reward), PAST.format("the reward")),
+    "the place before": (lambda: Before(Flat()), "has read from MuJoCo's state before it stepped"),
+    "a copy": (lambda: Copying(Flat()), "copies the environment, and noise reaches no copies"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("way", REFUSED)
+def test_wrappers_that_observe_the_place_past_the_noise_are_refused(way):
+    make, message = REFUSED[way]
+    with pytest.raises(BadInput, match=message):
+        from_gymnasium(make, steps=20)
 
 
 class Fixes(gym.Wrapper):
@@ -203,18 +184,6 @@ class Seldomer(Fixes):
     every = 230
 
 
-def test_what_wrappers_read_of_the_state_at_any_time_is_under_noise_or_refused():
-    with pytest.raises(BadInput, match="has read from MuJoCo's state before it stepped"):
-        from_gymnasium(lambda: Before(Flat()))
-    assert from_gymnasium(lambda: Fixes(Flat()), steps=60).specification.sensing == "now"
-    task = from_gymnasium(lambda: Seldomer(Flat()), steps=240)
-    assert not task.specification.sensing  # no trial is so long
-    agent = from_callable(lambda seen: np.zeros((len(seen), 2)), task)
-    noise = Noise("uniform", 0.1)
-    with pytest.raises(BadInput, match=r"has read from MuJoCo's state .* or reads seldom"):
-        simulate(task, agent, [-1.4, 0.5], noise)
-
-
 class Placed(gym.ObservationWrapper):
     """Shows where the body is, which the environment computes a physics step before the end of a step."""
 
@@ -222,8 +191,47 @@ class Placed(gym.ObservationWrapper):
         return np.append(self.unwrapped.data.body("puck").xpos[:2], observation[2:])
 
 
-def test_what_wrappers_read_lags_with_noise_as_without_it():
-    assert from_gymnasium(lambda: Placed(Flat())).specification.sensing == "earlier"
+def test_what_wrappers_read_of_the_state_at_any_time_is_under_noise_or_refused():
+    assert from_gymnasium(lambda: Fixes(Flat()), steps=60).specification.sensing == "now"
+    assert from_gymnasium(lambda: Placed(Flat()), steps=20).specification.sensing == "earlier"
+    task = from_gymnasium(lambda: Seldomer(Flat()), steps=240)
+    assert not task.specification.sensing  # no trial is so long
+    with pytest.raises(BadInput, match=r"has read from MuJoCo's state .* or reads seldom"):
+        simulate(task, always(task, 0, 0), [-1.4, 0.5], Noise("uniform", 0.1))
+
+
+class Ranging(gym.ObservationWrapper):
+    """Observes the distance of the goal, which it reads from MuJoCo's state."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.observation_space = numbers(7)
+
+    def observation(self, observation):
+        return np.append(observation, np.linalg.norm(self.unwrapped.data.qpos - GOAL))
+
+
+class RangingJudge(Ranging):
+    def step(self, action):
+        observation, reward, terminated, truncated, info = super().step(action)
+        info["success"] = bool(observation[-1] < 0.25)
+        return observation, reward, terminated, truncated, info
+
+
+def test_what_wrappers_observe_of_the_state_is_under_noise():
+    task = from_gymnasium(lambda: Ranging(Flat()), steps=5)
+    noise = np.zeros((6, 1, len(task.noisy)))
+    noise[:, :, 0] = 0.1
+    (arc,) = simulate(task, always(task, 0, 0), [[-1.0, 0.0]], Recorded(noise, 0.1))
+    assert arc.measured[0, 2 + 6] == pytest.approx(2.4, abs=1e-5)
+
+
+class OnTheLastStep(gym.Wrapper):
+    """Tells success when the time is over."""
+
+    def step(self, action):
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return observation, reward, terminated, truncated, info | {"success": truncated}
 
 
 class Steered(gym.Wrapper):
@@ -239,13 +247,42 @@ class Steered(gym.Wrapper):
         return self.seen, reward, *ends, {"success": bool(np.linalg.norm(self.seen[2:4]) < 0.25)}
 
 
-def test_a_wrapper_that_steers_and_judges_by_a_noisy_observation_is_refused():
-    with pytest.raises(BadInput, match="running without the noise, which must not judge"):
-        outcomes(lambda: Steered(Flat()), 0.2)
+@pytest.mark.parametrize(
+    ("make", "noise", "steps", "message"),
+    [
+        (lambda: RangingJudge(Flat()), 0.2, 60, r"sample\(s\) it is .*, and .* in the new one"),
+        (lambda: Steered(Flat()), 0.2, 60, "running without the noise, which must not judge"),
+        (
+            lambda: OnTheLastStep(TimeLimit(Flat(), 10)), 0.0, None,
+            r"after 10 sample\(s\) it is stalled, and reached in the",
+        ),
+    ],
+)  # fmt: skip
+def test_wrappers_that_judge_by_what_episodes_do_not_show_are_refused_in_runs(
+    make, noise, steps, message
+):
+    with pytest.raises(BadInput, match=message):
+        outcomes(make, noise, steps)
+
+
+# ---- wrappers do what they do
+
+
+class Judged(gym.Wrapper):
+    """Tells success from MuJoCo's state."""
+
+    def step(self, action):
+        observation, _, terminated, truncated, _ = self.env.step(action)
+        off = np.linalg.norm(self.unwrapped.data.qpos - GOAL)
+        return observation, -off, terminated, truncated, {"success": bool(off < 0.25)}
 
 
 class InPlace(gym.ObservationWrapper):
     """Changes what it is given, as a list, or a dictionary of which it takes entries away."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.observation_space = numbers(6)
 
     def observation(self, observation):
         if isinstance(observation, dict):
@@ -254,105 +291,79 @@ class InPlace(gym.ObservationWrapper):
         return observation[:2] + observation[2:]  # of arrays a sum
 
 
-class Listed(Flat):
+class Usual(Flat):
+    """Has attributes of any kind, a list for an observation, an array for a reward, None for `truncated`.
+
+    Its reset takes some steps.
+    """
+
+    walls = [[1, 2], [3]]
+
+    def __init__(self):
+        super().__init__()
+        self.rooms, self.rows = [[1, 2], [3]], iter([1])
+
     def _get_obs(self):
         return super()._get_obs().tolist()
 
-
-class Vector(InPlace):
-    def __init__(self, env):
-        super().__init__(env)
-        self.observation_space = NARROW
-
-
-@functools.cache
-def flat_puck():
-    return from_gymnasium(Flat, steps=60)
-
-
-@pytest.mark.first(1)
-@pytest.mark.parametrize("env", [Puck, Listed])
-def test_wrappers_get_what_the_environment_gives_and_may_change_it(env):
-    task = from_gymnasium(lambda: Vector(env()), steps=60)
-    assert ends(task) == plain()
-    assert ends(task, 0.1) == ends(flat_puck(), 0.1)
-
-
-class Late(Home):
-    """A camera that shows the place four samples late."""
-
-    def begin(self):
-        self.places = deque([self.data.qpos.copy()] * 5, maxlen=5)
-
-    def after(self):
-        self.places.append(self.data.qpos.copy())
-
-    def seen(self):
-        return self.places[0] if hasattr(self, "places") else self.data.qpos.copy()
-
-
-class Seldom(Home):
-    """Its first fix comes after 50 samples."""
-
-    def begin(self):
-        self.k, self.fix = 0, np.zeros(2)
-
-    def after(self):
-        self.k += 1
-        if self.k % 50 == 0:
-            self.fix = self.data.qpos.copy()
-
-    def _get_obs(self):
-        fix = getattr(self, "fix", np.zeros(2))
-        return np.concatenate([fix, GOAL - self.data.qpos, self.data.qvel])
-
-
-@pytest.mark.first(1)
-@pytest.mark.parametrize("slow", [Late, Seldom])
-def test_sensors_that_hold_or_delay_the_place_are_refused_where_resets_are_alike(slow):
-    with pytest.raises(BadInput, match=r"observation\[\d\] .*It is stored by step"):
-        from_gymnasium(slow)
-
-
-class Denied(Flat):
-    """Behind the rock step() puts another place into what it observes."""
+    def reset(self, **options):
+        super().reset(**options)
+        for _ in range(2):
+            self.step(np.zeros(2))
+        self.data.qvel[:] = 0
+        mujoco.mj_forward(self.model, self.data)
+        return self._get_obs(), {}
 
     def step(self, action):
-        observation, *rest = super().step(action)
-        if self.data.qpos[0] > 0.6 and abs(self.data.qpos[1]) < 0.75:
-            observation[:2] = 0.9, 0.4
-        return observation, *rest
+        observation, reward, terminated, _, info = super().step(action)
+        return observation, np.array([reward]), terminated, None, info
 
 
-def test_what_a_step_does_to_an_observation_is_noticed_where_it_does_it():
-    with pytest.raises(BadInput, match=r"has observed 0\.\d in .* gives .* in the same state"):
-        outcomes(Denied, 0.15)
+class Judging(Flat):
+    """Judges by its own observation, which it is given without noise, and tells nothing but success."""
+
+    def step(self, action):
+        observation, _, terminated, truncated, _ = super().step(action)
+        off = float(np.linalg.norm(observation[2:4]))
+        return observation, -off, terminated, truncated, {"success": True} if off < 0.25 else {}
 
 
-class Latching(Flat):
-    """Its sensor remembers that it was at a rare place."""
-
-    def _get_obs(self):
-        self.docked = getattr(self, "docked", False) or self.data.qpos[0] > 1.3
-        return super()._get_obs() + 0.1 * self.docked
-
-
-def test_an_observer_that_remembers_is_noticed():
-    with pytest.raises(BadInput, match=r"docked|in the same state|differs by"):
-        outcomes(Latching, 0.3)
+ALIKE = {
+    "usual habits, clipped actions and a judge of the state": (
+        lambda: ClipAction(Judged(InPlace(Usual()))), 0.2,
+    ),
+    "entries that are taken": (lambda: InPlace(Puck()), 0.1),
+    "a judge of its own observation": (Judging, 0.1),
+}  # fmt: skip
 
 
-class Blind(Flat):
-    def _get_obs(self):
-        return np.concatenate([self.data.qvel, np.zeros(4)])
+@pytest.mark.parametrize("name", ALIKE)
+def test_runs_end_as_without(name):
+    make, noise = ALIKE[name]
+    task = from_gymnasium(make, steps=60)
+    assert ends(task, noise) == plain(noise)
+    assert ends(task) == plain()
+    assert task.input_limits[1].tolist() == [4.0, 4.0]
 
 
-def test_noise_that_nothing_observes_is_refused():
-    with pytest.raises(BadInput, match="noise on x, y changes nothing that Blind observes"):
-        from_gymnasium(Blind)
+class Stopwatch(gym.Wrapper):
+    """Counts the samples at the goal in MuJoCo's data."""
+
+    def step(self, action):
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        data = self.unwrapped.data
+        data.userdata[0] += info["success"]
+        return observation, reward, terminated, truncated, {"success": bool(data.userdata[0] >= 3)}
 
 
-# ---- judges play with the noise
+class Counting(Flat):
+    xml = XML.replace("<worldbody>", '<size nuserdata="1"/><worldbody>')
+
+
+def test_what_wrappers_write_to_the_state_stays():
+    found = outcomes(lambda: Stopwatch(Counting()), 0.2)
+    assert {outcome for outcome, _ in found} == {"reached"}
+    assert all(late >= early + 2 for (_, late), (_, early) in zip(found, plain(0.2), strict=True))
 
 
 class Residual(gym.Wrapper):
@@ -388,7 +399,42 @@ def test_a_controller_in_a_wrapper_sees_the_noise():
     assert [samples for _, samples in outcomes(lambda: Residual(Flat()), 0.1)] == expected
 
 
-# ---- conditions
+def test_attributes_that_change_belong_to_each_run_and_a_time_limit_below_a_wrapper_counts():
+    task = from_gymnasium(lambda: Delayed(TimeLimit(Flat(), 200)))
+    assert task.max_steps == 200
+    assert not task.specification.memoryless
+    rng = np.random.default_rng(0)
+    z, u = task.starts(3, rng), rng.uniform(-4, 4, (6, 3, 2))
+    late, plain = task.plant(3), flat_task().plant(3)
+    for plant, t in ((late, task), (plain, flat_task())):
+        plant.set_state(*t.state(z))
+    plain.step(np.zeros((3, 2)))
+    for before in u:
+        late.step(before)
+        np.testing.assert_allclose(late.qpos, plain.qpos, atol=1e-12)
+        plain.step(before)
+
+
+@pytest.mark.long
+def test_loaded_statistics_and_what_is_shared_of_rewards_are_taken_and_a_count_is_said():
+    def normalised():
+        env = NormalizeObservation(Flat())
+        env.obs_rms.mean, env.update_running_mean = env.obs_rms.mean + 0.1, False
+        return env
+
+    class Counting(Flat):
+        episodes = 0
+
+        def begin(self, place):
+            self.episodes += 1
+
+    for make in (normalised, lambda: NormalizeReward(Flat())):
+        assert from_gymnasium(make, steps=20).max_steps == 20
+    found = from_gymnasium(Counting, steps=20).found
+    assert "because of what outlasts resets (episodes)" in found["episodes"]
+
+
+# ---- ends of episodes
 
 
 @pytest.mark.first(1)
@@ -401,131 +447,286 @@ def test_a_controller_in_a_wrapper_sees_the_noise():
 )
 def test_who_survives_until_the_time_is_over_succeeds(given, label):
     task = from_gymnasium(lambda: TimeLimit(Flat(), 20), **given)
-    agent = from_callable(lambda seen: np.zeros((len(seen), 2)), task)
-    arc = simulate(task, agent, [-1.4, 0.5])
+    arc = simulate(task, always(task, 0, 0), [-1.4, 0.5])
     assert (arc.outcome, len(arc.t) - 1) == (label, 20)
 
 
-# ---- what is told of a mistake
+@pytest.mark.long
+def test_the_shortest_of_several_time_limits_counts_and_a_run_may_be_simulated_for_longer():
+    task = from_gymnasium(lambda: TimeLimit(DtypeObservation(TimeLimit(Flat(), 12), float), 60))
+    assert task.max_steps == 12
+    assert max(samples for _, samples in ends(task)) <= 12
+    assert len(simulate(task, always(task, 0, 0), [-1.4, 0.5], horizon=2.0).t) - 1 == 20
 
 
-class Still(Flat):
-    def step(self, action):
-        self.data.qpos += 0.05 * np.asarray(action)
-        return self._get_obs(), 0.0, False, False, {"success": False}
+class Terminating(Flat):
+    """Reaching the goal ends the episode, as in the middle of a step, and so does touching something."""
 
-
-class Unrewarded(Flat):
-    def step(self, action):
-        observation, _, *rest = super().step(action)
-        return observation, None, *rest
-
-
-class Alone(Flat):
-    def reset(self, *, seed=None, options=None):
-        return super().reset(seed=seed)[0]
-
-
-class Longer(Flat):
-    def _get_obs(self):
-        return np.append(super()._get_obs(), 1.0)
-
-
-class Global(Flat):
-    def reset(self, *, seed=None, options=None):
-        found = super().reset(seed=seed)
-        self.goal = np.random.uniform(1.0, 1.5)
-        return found
+    touching = False
 
     def step(self, action):
-        *found, _ = super().step(action)
-        return *found, {"success": bool(self.data.qpos[0] > self.goal)}
+        self.data.ctrl[:] = np.clip(action, -4, 4)
+        for _ in range(5):
+            mujoco.mj_step(self.model, self.data)
+            off = float(np.linalg.norm(self.data.qpos - GOAL))
+            if off < 0.25:
+                break
+        ended = off < 0.25 or bool(self.touching and self.data.ncon)
+        return self._get_obs(), (5.0 if off < 0.25 else -off), ended, False, {}
 
 
-class Copying(gym.Wrapper):
+class Colliding(Terminating):
+    touching = True
+
+
+class Monitor(gym.Wrapper):
+    """A user's wrapper with the name of one that only counts: this one turns the actions."""
+
     def step(self, action):
-        import copy
+        return self.env.step(-np.asarray(action))
 
-        copy.deepcopy(self.env)
-        return self.env.step(action)
+
+def east(observation):
+    """An agent that drives to the right, and up or down by the second number that it sees."""
+    up = np.where(observation[:, 1] > 0, 1.0, -1.0)
+    return np.column_stack([np.full(len(observation), 1.5), up])
+
+
+BOTH = "terminated and reward >= 4 and distance(puck, goal) < 0.3"
+
+
+@pytest.mark.parametrize(
+    ("make", "success"),
+    [
+        (Terminating, "reward >= 4 and distance(puck, goal) < 0.3"),
+        (Colliding, BOTH),
+        (lambda: Monitor(Terminating()), "terminated"),
+    ],
+)
+def test_an_end_at_the_goal_is_an_arrival_and_a_collision_is_none(make, success):
+    task = from_gymnasium(make, success=success, steps=80)
+    turned = -1 if success == "terminated" else 1
+    agent = from_callable(lambda o: turned * east(o), task)
+    assert simulate(task, agent, [1.2, 0.0]).outcome == "reached"
+    if make is Colliding:
+        assert simulate(task, agent, [-1.0, 0.0]).outcome == "crashed"
 
 
 @pytest.mark.parametrize(
     ("make", "given", "message"),
     [
-        (Still, {}, "the time of Still stands still"),
-        (Unrewarded, {}, "returns None as its reward"),
-        (Alone, {}, r"reset\(\) of Alone returns a ndarray"),
-        (Longer, {}, "observes 7 number"),
-        (Global, {"seed": 0}, "draws goal from a global generator"),
-        (lambda: Copying(Flat()), {}, "copies the environment, and noise reaches no copies"),
+        (Colliding, {"success": "terminated"}, "touches what it does not touch elsewhere"),
+        (Puck, {"success": 'info["won"]'}, "that word: name an entry of info; it has had success"),
+        (Puck, {"failure": 'info["success"]'}, "it is a success .* and a failure"),
+        (
+            lambda: RecordEpisodeStatistics(Puck()), {"success": 'info["episode"]["r"] > 0'},
+            "runs are played without RecordEpisodeStatistics, so say it by reward",
+        ),
     ],
-)
-def test_mistakes_are_named(make, given, message):
+)  # fmt: skip
+def test_conditions_that_mislead_are_refused(make, given, message):
     with pytest.raises(BadInput, match=message):
         from_gymnasium(make, **given)
 
 
+def test_a_run_that_begins_in_a_wall_is_over_and_so_is_one_that_has_arrived():
+    task = flat_task()
+    arc = simulate(task, always(task, 0, 0), [0.0, 0.0])
+    assert (arc.outcome, len(arc.t)) == ("crashed", 1)
+    # The rock ends at x = -0.3, and the puck is 0.1 m wide: it may touch no deeper than runs do.
+    assert task.goes_on(np.array([[-0.41, 0.0], [-0.36, 0.0]])).tolist() == [True, False]
+    plant = task.plant(1)
+    plant.set_state(*task.state(np.array([[1.2, 0.0]])))
+    for _ in range(6):  # nobody looks at it
+        plant.step(np.array([[4.0, 0.0]]))
+    assert plant.measurement[0, -1] == 1
+
+
+# ---- what runs remember, and see
+
+
+class Key(Flat):
+    """The goal counts only once the robot has been at a key, far from where random inputs lead.
+
+    What it observes holds the last action, and how many times 50 samples have passed.
+    """
+
+    observation_space = numbers(7)
+    taken, last, k = False, np.zeros(2), 0
+
+    def begin(self, place):
+        self.taken, self.last, self.k = False, np.zeros(2), 0
+
+    def control(self, action):
+        self.last, self.k = np.array(action, dtype=float), self.k + 1
+        super().control(action)
+
+    def after(self):
+        self.taken = self.taken or bool(self.data.qpos[0] > 1.3 and self.data.qpos[1] > 1.0)
+
+    def arrived(self, off):
+        return off < 0.25 and self.taken
+
+    def _get_obs(self):
+        return np.concatenate([self.data.qpos, self.data.qvel, self.last, [self.k // 50]])
+
+
+def test_what_a_run_remembers_or_recalls_is_its_own():
+    key = from_gymnasium(Key, steps=60)
+    goal, at_key = [1.0, 0.0], [1.6, 0.9]
+    for u, start in (([0, 4], at_key), ([4, 0], goal)):  # the latter have taken no keys
+        arcs = simulate(key, always(key, *u), [start] * 2, horizon=3.0)
+        assert [arc.outcome for arc in arcs] == ["stalled"] * 2
+    plant = key.plant(2)
+    plant.set_state(*key.state(np.array([[-1.0, 0.5], [-1.2, 0.0]])))
+    plant.step(np.array([[1.0, 2.0], [3.0, -1.0]]))
+    noise = np.zeros((2, key.measurement_columns))
+    noise[:, :2] = 0.05
+    observed = key.observation(plant.observe(plant.truth(np.arange(2)), noise, np.arange(2)))
+    np.testing.assert_allclose(observed[:, 4:], [[1.0, 2.0, 0.0], [3.0, -1.0, 0.0]])
+    np.testing.assert_allclose(observed[:, :2], plant.qpos + 0.05)
+    assert key.specification.recalled.tolist() == [False] * 4 + [True] * 3
+    assert not key.abilities.restarts
+
+
+class Observing(Puck):
+    """What it observes is what one of its two observers says: they differ where it is far to the left."""
+
+    def get_obs(self):
+        return super()._get_obs()
+
+    def observe(self):
+        seen = self.get_obs()
+        return seen | {"position": np.clip(seen["position"], -1.45, 1.45)}
+
+    def first(self):
+        return np.maximum(super().first(), -1.4)
+
+    def reset(self, **options):
+        super().reset(**options)
+        return self.observe(), {}
+
+    def step(self, action):
+        result = super().step(0 * action)
+        return self.observe(), *result[1:]
+
+
 @pytest.mark.long
-def test_code_that_is_imported_again_is_another_environment(tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)
-    path = tmp_path / "changing.py"
-    text = (
-        "import gymnasium as gym\nfrom environments import Puck\n\n\nclass Changing(Puck):\n"
-        "    def step(self, action):\n        o, r, *rest, info = super().step(action)\n"
-        "        return o, r, *rest, {'success': r > -0.25}\n\n\n"
-        "gym.register('Changing-v0', 'changing:Changing', max_episode_steps=60)\n"
-    )
-    path.write_text(text)
-    before = from_gymnasium("changing:Changing-v0", steps=5)
-    assert from_gymnasium("changing:Changing-v0", steps=5) is before
-    path.write_text(text.replace("r > -0.25", "1 / 0"))
-    importlib.invalidate_caches()
-    importlib.reload(sys.modules["changing"])
-    with pytest.raises(BadInput, match="ZeroDivisionError"):
-        from_gymnasium("changing:Changing-v0", steps=5)
-    del gym.registry["Changing-v0"], sys.modules["changing"]
-
-
-# ---- agents
-
-
-class Mirrored(ActorCriticPolicy):
-    def get_distribution(self, obs):
-        return super().get_distribution(-obs)
-
-
-class Halved(SACPolicy):
-    def _predict(self, observation, deterministic=False):
-        return super()._predict(0.5 * observation, deterministic)
-
-
-@pytest.mark.parametrize(("algorithm", "policy"), [(PPO, Mirrored), (SAC, Halved)])
-def test_a_policy_class_of_one_s_own_is_refused(algorithm, policy, circle, tmp_path):
-    path = tmp_path / "agent.zip"
-    algorithm(policy, TaskVecEnv(BatchedEnv(circle, 1)), device="cpu").save(path)
-    with pytest.raises(BadInput, match="its policy is of a class of its own"):
-        load_agent(path, circle)
+def test_of_several_observers_the_one_that_is_called_counts():
+    task = from_gymnasium(Observing, steps=5)
+    noise = np.zeros((6, 1, len(task.noisy)))
+    noise[:, :, 0] = -0.1
+    (arc,) = simulate(task, always(task, 0, 0), [[-1.4, 0.0]], Recorded(noise, 0.1))
+    assert arc.measured[0, 2] == -1.45
 
 
 class Far(Flat):
     """Observes places on a map, of which single precision rounds half a metre; a reset has no options."""
 
-    def reset(self, seed=None):
-        return Flat.reset(self, seed=seed)
+    origin = np.array([652_341.0, 5_404_123.0, 0, 0, 0, 0])
 
-    def seen(self):
-        return self.data.qpos + np.array([652_341.0, 5_404_123.0])
+    def reset(self, seed=None):
+        return super().reset(seed=seed)
 
     def _get_obs(self):
-        return np.concatenate([self.seen(), GOAL - self.data.qpos, self.data.qvel])
+        return super()._get_obs() + self.origin
+
+
+def test_functions_get_the_precision_of_the_environment_and_a_reset_may_have_no_options():
+    task = from_gymnasium(Far, steps=60)
+    assert ends(task, pilot=lambda o: pilot(o - Far.origin)) == plain()
+
+
+def delayed_frames():
+    """Shows the puck a sample late, and the frame before."""
+    return FrameStackObservation(DelayObservation(FlattenObservation(Puck()), 1), 2)
+
+
+@pytest.fixture(scope="module")
+def framed():
+    return from_gymnasium(delayed_frames, steps=25)
+
+
+def test_noise_reaches_what_lies_around_an_environment_delays_and_frames(framed):
+    rng, values = np.random.default_rng(0), np.zeros((6, 1, framed.measurement_columns))
+    values[:, 0, :2] = rng.uniform(-0.1, 0.1, (6, 2))
+    arc = simulate(
+        framed, always(framed, 0.5, 0.1), [-1.0, 0.5], Recorded(values, 0.1), horizon=0.5
+    )
+    at = 2 * [*Puck.observation_space.spaces].index("position")
+    last = arc.measured[4, 2:-3].reshape(-1, 6)[:, at : at + 2]
+    np.testing.assert_allclose(last, (arc.z + values[:, 0, :2])[2:4], atol=1e-6)
+
+
+@pytest.mark.parametrize("is_wrapped", [False, True])
+@pytest.mark.parametrize("kind", ["none", "uniform", "alternating", "attack"])
+def test_runs_do_not_depend_on_how_many_are_played_side_by_side(
+    is_wrapped, kind, framed, monkeypatch
+):
+    task, rng = framed if is_wrapped else flat_task(), np.random.default_rng(0)
+    loop = PolicyController(from_callable(east, task))
+    z, found = task.starts(9, rng), []
+    settings = LoopSettings(record=True, passing=True, steps=25)
+    assert task.abilities.side_by_side > 9
+    for side in (9, 2):
+        monkeypatch.setattr(task, "abilities", replace(task.abilities, side_by_side=side))
+        noise = Noise() if kind in ("none", "attack") else Noise(kind, 0.1)
+        if kind == "attack":
+            rules = Rules(task, loop, 0.1, np.array(task.noisy))
+            programmes = np.random.default_rng(1).integers(len(rules) - 1, size=(9, 3))
+            noise = Programmes(task, loop, rules, programmes, 4)
+        run = closed_loop(task, loop, z, noise, seed=1, settings=settings)
+        found.append((run, getattr(noise, "values", np.zeros(1)), getattr(noise, "danger", 0)))
+    (a, *of_a), (b, *of_b) = found
+    assert np.ptp(a.length) > 0
+    for name in ("path", "length", "outcome", "q0", "before", "q", "u", "state"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), name)
+    for i, end in enumerate(a.length):
+        np.testing.assert_array_equal(a.measured[:end, i], b.measured[:end, i])
+        np.testing.assert_array_equal(a.true[:end, i], b.true[:end, i])
+    for one, other in zip((a.passing.turned, *of_a), (b.passing.turned, *of_b), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+class Behind(Puck):
+    """It observes places as `mj_step` leaves them behind: those of the physics step before.
+
+    Around it there are no walls, but the rock.
+    """
+
+    xml = "\n".join(line for line in XML.splitlines() if '<geom type="box"' not in line)
+    observation_space = gym.spaces.Dict({**Puck.observation_space.spaces, "was_at": numbers(2)})
+
+    def _get_obs(self):
+        was_at = self.data.xpos[self.model.body("puck").id, :2].copy()
+        return super()._get_obs() | {"was_at": was_at}
+
+
+def test_what_lags_by_a_physics_step_is_moved_by_noise_where_the_robot_was_then():
+    task = from_gymnasium(Behind, steps=60)
+    # Walls in the open do not end the chart.
+    assert np.all(np.less(task.chart.low, [-1.8, -1.2]))
+    assert np.all(np.greater(task.chart.high, [0.5, 1.2]))
+    assert "a physics step before" in task.found["lag"]
+    assert "lag" not in flat_task().found
+    plant, rows = task.plant(2), np.arange(2)
+    plant.set_state(*task.state(np.array([[-1.2, 0.4], [-1.2, 0.4]])))
+    noise = np.zeros_like(plant.measurement)
+    noise[1, :2] = 0.03, -0.02
+    for _ in range(3):
+        plant.step(np.tile([2.0, 1.0], (2, 1)))
+    true, alike = plant.observe(plant.truth(rows), noise, rows)
+    seen = slice(-3 - 2, -3)  # before reward, success and outcome
+    assert not np.allclose(true[seen], true[:2], rtol=0, atol=1e-4)  # it moves
+    np.testing.assert_allclose(alike[seen] - true[seen], noise[1, :2], rtol=0, atol=1e-12)
 
 
 @pytest.mark.long
-def test_functions_get_the_precision_of_the_environment_and_a_reset_may_have_no_options():
-    task = from_gymnasium(Far, steps=60)
-    origin = np.array([652_341.0, 5_404_123.0, 0, 0, 0, 0])
-    agent = from_callable(lambda seen: np.clip(pilot(seen - origin), -4, 4), task)
-    found = [(arc.outcome, len(arc.t) - 1) for arc in simulate(task, agent, STARTS)]
-    assert found == plain()
+def test_variables_of_a_script_are_not_those_of_its_environment(monkeypatch):
+    script = type(sys)("a_script")
+    monkeypatch.setitem(sys.modules, "a_script", script)
+    script.results = []
+    task = from_gymnasium(type("Scripted", (Flat,), {"__module__": "a_script"}), steps=60)
+    for _ in range(2):
+        script.results.append(ends(task, starts=STARTS[:1]))
+    assert script.results == [plain()[:1]] * 2
