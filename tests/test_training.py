@@ -99,7 +99,7 @@ def trained():
         ):  # fmt: skip
             task = hyrl_mj.get_task(name)
             settings = preset(task, "smoke", algorithm=algorithm).stage1
-            settings = replace(settings, samples=samples, rehearse=0.0)
+            settings = replace(settings, samples=samples)
             with TemporaryDirectory() as folder:
                 training.train(task, settings, seed=4, log_dir=Path(folder))
                 found.append((Path(folder) / "checkpoint.safetensors").read_bytes())
