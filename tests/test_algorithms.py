@@ -177,14 +177,6 @@ def test_it_trains_a_policy_that_answers_as_sb3_does(learned):
     np.testing.assert_allclose(policy.inputs(observation), core.inputs(actions), atol=1e-5)
 
 
-@pytest.mark.parametrize("algorithm", ["a2c", "sac", "td3"])
-@pytest.mark.slow
-def test_the_seed_fixes_the_policy(algorithm, circle, quickly_judged):
-    first, again = (train(circle, quick(circle, algorithm), 4).weights for _ in range(2))
-    assert first.keys() == again.keys()
-    assert all(np.array_equal(first[name], again[name]) for name in first)
-
-
 @pytest.mark.slow
 def test_actors_and_critics_respect_the_mirror(learned):
     task, model, _, policy = learned

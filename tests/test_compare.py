@@ -36,6 +36,7 @@ from hyrl_mj.simulation import LoopSettings, closed_loop
 from hyrl_mj.tasks import Outcome
 from hyrl_mj.viz.compared_tables import ranked, result_table, sentences, tried_table
 
+
 def raises(error):
     """Returns a function that raises an error, whatever it is given."""
 
@@ -309,7 +310,9 @@ def test_hysteresis_alone_goes_on_beyond_the_decision_of_the_policy(given):
     q = candidate.controller.initial_mode(ahead)
     u, after = candidate.controller.step(q, beyond)
     assert after == q
-    assert np.sign(u) == np.sign(given.run.policy.act(ahead)) != np.sign(given.run.policy.act(beyond))
+    assert (
+        np.sign(u) == np.sign(given.run.policy.act(ahead)) != np.sign(given.run.policy.act(beyond))
+    )
 
 
 # ---- the comparison
@@ -352,9 +355,7 @@ def small():
 @pytest.fixture(scope="module")
 def result(folder, small):
     said = []
-    found = hyrl_mj.compare(
-        "unit_circle", out=folder, only=("held",), say=said.append, **RUNS
-    )
+    found = hyrl_mj.compare("unit_circle", out=folder, only=("held",), say=said.append, **RUNS)
     return found, said
 
 

@@ -12,13 +12,15 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from attacks.crafted_runs import MARKER
 from attacks.doors import plant_modules
 from command_line import call
-from planted import TINY, coarsen, shorten
+from planted import TINY, coarsen, decisions, halves, shorten
+from test_report import plant
 
 import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, pipeline
@@ -37,7 +39,8 @@ from hyrl_mj.system import cores, progress
 from hyrl_mj.viz import commands, sweep_tables, tables
 
 CIRCLE = Setting("unit_circle", "", 0.1)
-SMOKE = {"preset": "smoke", "set": TINY}
+LESS = TINY | {"stage1.samples": 2_048, "stage6.samples": 2_048}
+SMOKE = {"preset": "smoke", "set": LESS}
 
 
 # ---- settings that are changed
@@ -101,7 +104,6 @@ def test_bad_sweeps_make_nothing(tmp_path):
         ("unit_circle", {"set": {"latice": 1}}, "Did you mean 'lattice'"),
         ("unit_circle", {"cores": 0}, "cores 0 cannot be used"),
         ("unit_circle", {"memory": -1}, "memory -1 cannot be used"),
-        ("unit_circle", {"memory": 9_999.0}, r"no machine has \d+ core"),
         ("unit_circle", {"address": "nowhere"}, "give HOST:PORT"),
         ("unit_circle", {"address": "127.0.0.1:1"}, "no Ray cluster answers at 127.0.0.1:1"),
         ("unit_circle", {"address": "a..b:1"}, "no Ray cluster answers at a..b:1"),
@@ -109,6 +111,18 @@ def test_bad_sweeps_make_nothing(tmp_path):
         with pytest.raises(BadInput, match=message):
             hyrl_mj.sweep(tasks, out=out, say=str, **{"preset": "smoke", **changes})
         assert not out.exists()
+
+
+def test_runs_for_which_no_machine_has_room_are_refused():
+    nodes = [{"Alive": alive, "Resources": {"CPU": 4, "memory": 2e9}} for alive in (True, False)]
+    ray = SimpleNamespace(nodes=lambda: nodes)
+    assert [cluster.share(ray, runs, None, 1.0) for runs in (1, 2, 9)] == [4, 2, 1]
+    assert cluster.share(ray, 1, 3, 1.0) == 3
+    for wanted, memory in ((5, 1.0), (None, 3.0)):
+        with pytest.raises(
+            BadInput, match=r"no machine has \d cores and \d GB free .*4 and 2\.0 GB"
+        ):
+            cluster.share(ray, 1, wanted, memory)
 
 
 @pytest.mark.parametrize("seeds", ["9-0", "", "a", "1-", "0-9-2", "0-99999999999"])
@@ -320,12 +334,12 @@ def swept(small_runs, made_once):
 @pytest.mark.slow
 def test_a_changed_setting_stands_in_the_run_and_in_the_message_about_another(swept):
     run = hyrl_mj.load_run(swept[0] / "unit_circle-0.1-0")
-    assert run.settings.stage1.samples == TINY["stage1.samples"]
+    assert run.settings.stage1.samples == LESS["stage1.samples"]
     assert commands.changed(run) == []
     for name in ("rods", "cells"):  # the others are as in the preset, which is shortened here
-        assert f"{name}={TINY[name]}" in commands.beginning(run)
-    other = {**TINY, "stage1.samples": 8192}
-    with pytest.raises(BadInput, match=r"stage1\.samples: 4096 there, 8192 given"):
+        assert f"{name}={LESS[name]}" in commands.beginning(run)
+    other = {**LESS, "stage1.samples": 8192}
+    with pytest.raises(BadInput, match=r"stage1\.samples: 2048 there, 8192 given"):
         hyrl_mj.run("unit_circle", preset="smoke", set=other, out=run.path)
 
 
@@ -337,25 +351,15 @@ def test_nobody_else_can_reach_it(swept):
     assert swept[3] <= loopback
 
 
-TRAINED = ("train", "critical-set", "partition", "extended-sets", "retrain")
-
-
-def begun(path, settings):
-    """A run directory in which all stages ran that train, in this process."""
-    run = Run(path, settings)
-    path.mkdir()
-    write_config(run)
-    for stage in TRAINED:
-        run = pipeline.run_stage(run, stage, str)
-    return run
-
-
 @pytest.mark.slow
 def test_a_sweep_makes_the_runs_that_are_made_one_by_one(swept, circle, tmp_path):
     out, result, said, _ = swept
     assert [row.state for row in result.rows] == ["done", "done"]
     assert any("unit_circle-0.1-1" in line and "retrain" in line for line in said)
-    run = begun(tmp_path / "run", changed(replace(preset(circle, "smoke"), seed=1), TINY))
+    run = Run(tmp_path, changed(replace(preset(circle, "smoke"), seed=1), LESS))
+    write_config(run)
+    for stage in ("train", "critical-set", "partition", "extended-sets", "retrain"):
+        run = pipeline.run_stage(run, stage, str)
     made = hyrl_mj.load_run(out / "unit_circle-0.1-1")
     names = ("policy.safetensors", "mode_0.safetensors", "mode_1.safetensors")
     for name in (*names, "extended_sets.npz", "critical_set.npz"):
@@ -408,7 +412,7 @@ def test_a_cluster_of_two_machines_makes_runs_on_both_and_goes_on_after_one_that
         page.rename(page.with_name("hidden"))
     broken = out / "unit_circle-0.1-2"
     broken.write_text("a file where the run directory should be")
-    Sweep(Common("smoke", None, TINY), tuple(Row(CIRCLE, seed) for seed in (0, 1))).save(out)
+    Sweep(Common("smoke", None, LESS), tuple(Row(CIRCLE, seed) for seed in (0, 1))).save(out)
 
     def make(row, options, *_):
         """Finds the page of a run again, while another machine does the same."""
@@ -432,7 +436,7 @@ def test_a_cluster_of_two_machines_makes_runs_on_both_and_goes_on_after_one_that
     ) as two:
         words = ["sweep", "unit_circle", "--seeds", "0-2", "--preset", "smoke", "--out", out]
         words += ["--address", two.stdout.readline().strip()]
-        done = call(*words, "--set", *(f"{k}={v}" for k, v in TINY.items()))
+        done = call(*words, "--set", *(f"{k}={v}" for k, v in LESS.items()))
         two.stdin.close()
     assert done.returncode == 1, done.stderr
     rows = Sweep.load(out).rows
@@ -511,6 +515,7 @@ def doubled(monkeypatch):
 
 @pytest.mark.slow
 def test_episodes_are_the_same_with_a_pool(circle, doubled, monkeypatch):
+    monkeypatch.setattr(type(circle), "max_steps", 20)
     monkeypatch.setattr(episodes, "BATCH", 64)
     count = partial(
         noisy_episodes,
@@ -528,16 +533,17 @@ def test_episodes_are_the_same_with_a_pool(circle, doubled, monkeypatch):
 
 
 @pytest.mark.slow
-def test_modes_are_the_same_with_a_pool(small_runs, doubled, tmp_path):
+def test_modes_are_the_same_with_a_pool(small_runs, doubled, circle, tmp_path):
     """The lopsided circle has no mirror, so that its modes are trained side by side."""
-    task = tmp_path / "lopsided.py"
-    task.write_text(LOPSIDED)
-    shutil.copytree(mjcf.models_dir(), tmp_path, dirs_exist_ok=True)
-    (tmp_path / "unit_circle.xml").rename(tmp_path / "lopsided.xml")
-    less = TINY | {"stage1.samples": 2_048, "stage6.samples": 2_048}
-    plain = begun(tmp_path / "plain", changed(preset(hyrl_mj.get_task(task), "smoke"), less))
+    path = tmp_path / "lopsided.py"
+    path.write_text(LOPSIDED)
+    shutil.copy(mjcf.models_dir() / "unit_circle.xml", tmp_path / "lopsided.xml")
+    shutil.copytree(mjcf.models_dir() / "common", tmp_path / "common")
+    task = hyrl_mj.get_task(path)
+    few = replace(preset(task, "smoke").stage6, samples=2_048)
+    plain = plant(tmp_path / "plain", task, decisions(circle), halves(circle), stage6=few)
     pooled = hyrl_mj.load_run(shutil.copytree(plain.path, tmp_path / "pooled"))
-    (pooled.path / "mode_0.safetensors").unlink()
+    pipeline.run_stage(plain, "retrain", str)
     with hyrl_mj.using_pool(doubled):
         pipeline.run_stage(pooled, "retrain", str)
     assert doubled.jobs == 2

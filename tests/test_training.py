@@ -22,7 +22,7 @@ from hyrl_mj.learning import training
 from hyrl_mj.learning.presets import preset
 
 # Samples of the quickest training that still updates the networks several times.
-FEW = {"ppo": 8_192, "dqn": 4_000}
+FEW = {"ppo": 4_096, "dqn": 4_000}
 
 
 @pytest.fixture
@@ -95,11 +95,11 @@ def trained():
         spare(patch, checkpoints=1)
         patch.setattr(training, "EPISODES", 16)
         for name, algorithm, samples in (
-            ("unit_circle", "ppo", 2_048), ("vehicle", "dqn", 2_200), ("unit_circle", "sac", 1_200),
+            ("unit_circle", "ppo", 2_048), ("vehicle", "dqn", 2_200), ("unit_circle", "td3", 1_200),
         ):  # fmt: skip
             task = hyrl_mj.get_task(name)
             settings = preset(task, "smoke", algorithm=algorithm).stage1
-            settings = replace(settings, samples=samples)
+            settings = replace(settings, samples=samples, rehearse=0.0)
             with TemporaryDirectory() as folder:
                 training.train(task, settings, seed=4, log_dir=Path(folder))
                 found.append((Path(folder) / "checkpoint.safetensors").read_bytes())
@@ -107,18 +107,17 @@ def trained():
 
 
 @pytest.mark.slow
-def test_cores_do_not_matter(tmp_path):
+def test_cores_do_not_matter():
     """Another process, in which BLAS and torch have four threads, trains the same."""
     here = Path(__file__).parent
-    program = "import pickle, sys; from test_training import trained; pickle.dump(trained(), open(sys.argv[1], 'wb'))"
+    program = (
+        "import pickle, sys, test_training as t; sys.stdout.buffer.write(pickle.dumps(t.trained()))"
+    )
     path = os.pathsep.join([str(Path(hyrl_mj.__file__).parents[1]), str(here)])
     threads = {"OMP_NUM_THREADS": "4", "OPENBLAS_NUM_THREADS": "4"}
-    subprocess.run(
-        [sys.executable, "-c", program, tmp_path / "weights"],
-        env=unmeasured.environment(PYTHONPATH=path, **threads),
-        check=True,
-    )
-    for own, other in zip(trained(), pickle.loads((tmp_path / "weights").read_bytes()), strict=True):
+    env = unmeasured.environment(PYTHONPATH=path, **threads)
+    done = subprocess.run([sys.executable, "-c", program], env=env, capture_output=True, check=True)
+    for own, other in zip(trained(), pickle.loads(done.stdout), strict=True):
         assert own == other
 
 
@@ -232,7 +231,7 @@ def test_a_ground_sees_a_policy_from_the_first_checkpoint_and_scores_it_after_ha
 
     spare(monkeypatch, checkpoints=8)
     settings = preset(vehicle, "smoke", algorithm="ppo").stage1
-    settings = replace(settings, samples=8_192, envs=16, hidden=(8, 8))
+    settings = replace(settings, samples=4_096, envs=16, hidden=(8, 8))
     training.train(vehicle, settings, 0, ground=Ground(vehicle, settings))
     half = calls.index("scored")
     assert half == 3
