@@ -145,17 +145,14 @@ def planted_circle(made_once):
 
     As on a machine that cannot draw: there is no video.
     """
-    from planted import FEW_CELLS, decisions, halves, without_pictures
+    from planted import FEW_CELLS, decisions, halves, without_pictures, without_videos
     from test_report import plant
-
-    def no_renderer(*arguments, **options):
-        raise hyrl_mj.NoRenderer("no GL library here")
 
     def make(folder):
         task, said, path = hyrl_mj.get_task("unit_circle"), [], folder / "unit_circle"
         plant(path, task, decisions(task), halves(task), **FEW_CELLS)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("hyrl_mj.viz.replay.render_replay", no_renderer)
+            without_videos(patch)
             without_pictures(patch)
             hyrl_mj.run("unit_circle", preset="smoke", set=FEW_CELLS, out=path, say=said.append)
         (folder / "said.json").write_text(json.dumps(said))

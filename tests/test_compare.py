@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from command_line import call
-from planted import FEW_CELLS
+from planted import FEW_CELLS, few_replays, without_videos
 
 import hyrl_mj
 from hyrl_mj import BadInput
@@ -26,7 +26,6 @@ from hyrl_mj.alternatives.training import environment, learned
 from hyrl_mj.files import artifacts
 from hyrl_mj.judging import examination
 from hyrl_mj.judging.game import ReplayCount
-from hyrl_mj.judging.proof import replays
 from hyrl_mj.learning.training import export
 from hyrl_mj.pipeline import comparing, steps, sweeping
 from hyrl_mj.policies import PolicyController, from_callable
@@ -307,8 +306,8 @@ def test_an_alternative_gets_the_samples_of_the_whole_run(planted_circle):
 def test_hysteresis_alone_goes_on_beyond_the_decision_of_the_policy(given):
     (candidate,) = registered()["hysteresis"].candidates(given)
     ahead, beyond = np.array([[np.pi - 0.5]]), np.array([[np.pi + 0.05]])
-    q = candidate.controller.initial_mode(ahead)
-    u, after = candidate.controller.step(q, beyond)
+    q = candidate.acts.initial_mode(ahead)
+    u, after = candidate.acts.step(q, beyond)
     assert after == q
     assert (
         np.sign(u) == np.sign(given.run.policy.act(ahead)) != np.sign(given.run.policy.act(beyond))
@@ -334,21 +333,15 @@ def folder(planted_circle, tmp_path_factory):
 @pytest.fixture(scope="module")
 def small():
     """Comparisons with little noise and no video."""
-    all_noises = replays._noises
-
-    def few_noises(*arguments):
-        noises = all_noises(*arguments)
-        return {kind: noises[kind] for kind in ("none", "alternating")}
-
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(replays, "_noises", few_noises)
+        few_replays(patch)
+        without_videos(patch)
         patch.setattr(comparing, "CHOICE_STARTS", 16)
         patch.setattr(comparing, "CHOICE_ROUNDS", 1)
         patch.setattr(comparing, "EPISODES", 64)
         little = replace(steps.SPARING, episodes=20, attack_starts=12, attack_rounds=1)
         patch.setattr(steps, "SPARING", little)
         patch.setattr(examination, "usual_kinds", lambda *_: ("none", "uniform"))
-        patch.setattr("hyrl_mj.viz.replay.render_replay", raises(hyrl_mj.NoRenderer("no GL")))
         yield
 
 
@@ -406,16 +399,13 @@ def test_rows_of_other_code_are_made_again(result, circle):
     assert comparing._without_outdated(changed, task, len).rows == ()
 
 
-@pytest.mark.parametrize(
-    "mistake",
-    [Unfit("nothing fits it"), BadInput("nothing fits it"), ValueError("nothing fits it"), None],
-)
-def test_a_file_makes_an_alternative_which_may_not_fit(mistake, result, folder, small, monkeypatch):
+def never(monkeypatch, mistake=None):
+    """Registers, in this test alone, an alternative that ends in a mistake after its first setting."""
     monkeypatch.setattr(base, "_KNOWN", dict(base._KNOWN))
 
     @register
     class Never(Alternative):
-        name, title = f"never-{type(mistake).__name__}", "never"
+        name = title = "never"
 
         def candidates(self, given):
             if mistake is None:
@@ -423,21 +413,33 @@ def test_a_file_makes_an_alternative_which_may_not_fit(mistake, result, folder, 
             yield Candidate("first", given.run.controllers["policy"])
             raise mistake
 
-    says = {ValueError: "it raises ValueError: nothing fits it", type(None): "yields no setting"}
+
+@pytest.mark.parametrize(
+    ("mistake", "says"),
+    [
+        (BadInput("nothing fits it"), "nothing fits it"),
+        (ValueError("nothing fits it"), "it raises ValueError: nothing fits it"),
+        (None, "yields no setting"),
+    ],
+)
+def test_an_alternative_that_makes_a_mistake_is_unfit(mistake, says, planted_circle, monkeypatch):
+    never(monkeypatch, mistake)
+    row = comparing.judged(planted_circle[0], "never", seed=0)
+    assert row.state == "unfit"
+    assert says in row.sentence
+
+
+def test_what_did_not_fit_is_tried_again(result, folder, small, monkeypatch):
+    never(monkeypatch, Unfit("nothing fits it"))
     said = []
     for _ in range(2):  # what did not fit may fit now, as where a package was missing
-        found = hyrl_mj.compare(
-            "unit_circle", out=folder, only=(Never.name,), say=said.append, **RUNS
-        )
-    assert sum(text.startswith(Never.name) for text in said) == 2
-    row = found.row(Never.name, 0)
-    assert row.state == "unfit"
-    assert says.get(type(mistake), "nothing fits it") in row.sentence
-    assert any(row.sentence in sentence for sentence in sentences(found))
+        found = hyrl_mj.compare("unit_circle", out=folder, only=("never",), say=said.append, **RUNS)
+    assert said.count("never: nothing fits it") == 2
+    assert any("nothing fits it" in sentence for sentence in sentences(found))
 
 
 def test_a_name_is_that_of_one_alternative():
-    with pytest.raises(BadInput, match=r"'hyrl' is already hyrl_mj\.alternatives\.of_run\.Hyrl"):
+    with pytest.raises(BadInput, match=r"'hyrl' is already hyrl_mj\.alternatives\.ablation\.Hyrl"):
         register(type("Mine", (Alternative,), {"name": "hyrl", "candidates": None}))
 
 

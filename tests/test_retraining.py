@@ -87,7 +87,7 @@ def discounted(circle, domain, start, u, gamma=0.95):
     return total
 
 
-@pytest.mark.parametrize("eps", [0.05, 0.15, 0.25, 0.29])
+@pytest.mark.parametrize("eps", [0.05, 0.29])
 def test_it_pays_to_go_back_from_the_farthest_edge(circle, eps):
     parts, sets = circle_sets(circle, eps)
     domain = mode_ground(circle, sets, 0, parts).domain(gamma=0.95)
@@ -398,16 +398,6 @@ def test_modes_are_trained_and_judged_under_what_the_sensor_does(
     policy, result = retrain(ground, settings, seed=0)
     assert result.attempts == 1
     assert ground(policy) < ground.enough, "so little training does not suffice"
-
-
-@pytest.mark.slow
-def test_a_mirror_image_is_taken_there_too(puck, puck_sets, monkeypatch):
-    settings = replace(preset(puck, "smoke").stage6, samples=4_096)
-    other = training.export(training.build(puck, settings, seed=0), puck)
-    monkeypatch.setattr(ByEpisodes, "judge", lambda *_, **__: Judged((20.0, -1.0), True))
-    found, _ = retrain(by_episodes(puck, puck_sets, 1), settings, seed=0, others=[(other, HALF)])
-    for name, weight in symmetry.mirrored(other).weights.items():
-        np.testing.assert_array_equal(found.weights[name], weight)
 
 
 @pytest.mark.slow

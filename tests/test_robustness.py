@@ -137,7 +137,9 @@ def test_a_game_under_noise_that_hides_everything_is_refused(vehicle):
 # ---- the time of an episode
 
 
-def test_won_is_what_arrives_before_the_episode_ends(circle):
+def test_won_is_what_arrives_before_the_episode_ends(circle, monkeypatch):
+    monkeypatch.setattr(examination, "CURVE", CURVE[::8])
+
     def quarter(z):
         return np.where(circle.chart.wrap(z) < PI, -0.25, 0.25)  # it takes 11 s for the longest way
 

@@ -16,7 +16,7 @@ import unmeasured
 from planted import spare
 
 import hyrl_mj
-from hyrl_mj import BadInput, MlpPolicy, Noise
+from hyrl_mj import MlpPolicy, Noise
 from hyrl_mj.gym_export.core import BatchedEnv
 from hyrl_mj.learning import training
 from hyrl_mj.learning.presets import preset
@@ -141,11 +141,6 @@ def test_it_goes_on_from_a_policy(task):
     settings = preset(task, "paper").stage6
     model = training.build(task, settings, seed=1, start_from=start)
     assert_same_weights(training.export(model, task), start)
-
-
-def test_an_unknown_algorithm_lists_the_known(vehicle):
-    with pytest.raises(BadInput, match="unknown algorithm 'sarsa': choose one of ppo, a2c, dqn"):
-        replace(preset(vehicle, "smoke").stage1, algorithm="sarsa")
 
 
 # ---- returns
