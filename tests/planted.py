@@ -32,7 +32,7 @@ from hyrl_mj.viz.figures import style
 # Settings of a smoke run on the circle whose worst-case game takes two seconds.
 FEW_CELLS = {"lattice": 130}
 # Settings of the runs of a sweep, which are made in processes that `shorten` does not reach.
-TINY = {"stage1.samples": 4096, "stage6.samples": 4096, "lattice": 130, "rods": 100, "cells": 240}
+TINY = {"stage1.samples": 2048, "stage6.samples": 2048, "lattice": 130, "rods": 100, "cells": 240}
 
 
 def shorten(patch):

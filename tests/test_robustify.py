@@ -77,7 +77,9 @@ def make_robust(folder):
     diagnosed = call("diagnose", *options)
     assert diagnosed.returncode == 0, diagnosed.stderr
     before = contents(path)
-    done = call("robustify", *options)
+    with pytest.MonkeyPatch.context() as patch:
+        few_replays(patch)
+        done = call("robustify", *options)
     assert_has_ended(done)
     (folder / "told").write_bytes(pickle.dumps((diagnosed.stdout, before, done.stdout)))
 

@@ -19,7 +19,7 @@ import pytest
 from attacks.crafted_runs import MARKER
 from attacks.doors import plant_modules
 from command_line import call
-from planted import TINY, coarsen, decisions, halves, shorten
+from planted import TINY, coarsen, decisions, few_replays, halves, shorten
 from test_report import plant
 
 import hyrl_mj
@@ -39,8 +39,7 @@ from hyrl_mj.system import cores, progress
 from hyrl_mj.viz import commands, sweep_tables, tables
 
 CIRCLE = Setting("unit_circle", "", 0.1)
-LESS = TINY | {"stage1.samples": 2_048, "stage6.samples": 2_048}
-SMOKE = {"preset": "smoke", "set": LESS}
+SMOKE = {"preset": "smoke", "set": TINY}
 
 
 # ---- settings that are changed
@@ -299,6 +298,7 @@ def made_shortly(row, options, *more):
     """Does a run as the processes of a sweep do, but shorter."""
     shorten(patch := pytest.MonkeyPatch())
     coarsen(patch)
+    few_replays(patch)
     return cluster.make(row, options, *more)
 
 
@@ -334,11 +334,11 @@ def swept(small_runs, made_once):
 @pytest.mark.slow
 def test_a_changed_setting_stands_in_the_run_and_in_the_message_about_another(swept):
     run = hyrl_mj.load_run(swept[0] / "unit_circle-0.1-0")
-    assert run.settings.stage1.samples == LESS["stage1.samples"]
+    assert run.settings.stage1.samples == TINY["stage1.samples"]
     assert commands.changed(run) == []
     for name in ("rods", "cells"):  # the others are as in the preset, which is shortened here
-        assert f"{name}={LESS[name]}" in commands.beginning(run)
-    other = {**LESS, "stage1.samples": 8192}
+        assert f"{name}={TINY[name]}" in commands.beginning(run)
+    other = {**TINY, "stage1.samples": 8192}
     with pytest.raises(BadInput, match=r"stage1\.samples: 2048 there, 8192 given"):
         hyrl_mj.run("unit_circle", preset="smoke", set=other, out=run.path)
 
@@ -356,7 +356,7 @@ def test_a_sweep_makes_the_runs_that_are_made_one_by_one(swept, circle, tmp_path
     out, result, said, _ = swept
     assert [row.state for row in result.rows] == ["done", "done"]
     assert any("unit_circle-0.1-1" in line and "retrain" in line for line in said)
-    run = Run(tmp_path, changed(replace(preset(circle, "smoke"), seed=1), LESS))
+    run = Run(tmp_path, changed(replace(preset(circle, "smoke"), seed=1), TINY))
     write_config(run)
     for stage in ("train", "critical-set", "partition", "extended-sets", "retrain"):
         run = pipeline.run_stage(run, stage, str)
@@ -412,7 +412,7 @@ def test_a_cluster_of_two_machines_makes_runs_on_both_and_goes_on_after_one_that
         page.rename(page.with_name("hidden"))
     broken = out / "unit_circle-0.1-2"
     broken.write_text("a file where the run directory should be")
-    Sweep(Common("smoke", None, LESS), tuple(Row(CIRCLE, seed) for seed in (0, 1))).save(out)
+    Sweep(Common("smoke", None, TINY), tuple(Row(CIRCLE, seed) for seed in (0, 1))).save(out)
 
     def make(row, options, *_):
         """Finds the page of a run again, while another machine does the same."""
@@ -436,7 +436,7 @@ def test_a_cluster_of_two_machines_makes_runs_on_both_and_goes_on_after_one_that
     ) as two:
         words = ["sweep", "unit_circle", "--seeds", "0-2", "--preset", "smoke", "--out", out]
         words += ["--address", two.stdout.readline().strip()]
-        done = call(*words, "--set", *(f"{k}={v}" for k, v in LESS.items()))
+        done = call(*words, "--set", *(f"{k}={v}" for k, v in TINY.items()))
         two.stdin.close()
     assert done.returncode == 1, done.stderr
     rows = Sweep.load(out).rows
