@@ -55,11 +55,12 @@ def memory_of_a_file():
     """What the tests of a file have freed goes back to the system, if it is much: each fork copies less.
 
     The simulations of hundreds of environments are freed in pieces between which others live, and glibc keeps
-    all of it.
+    all of it. What lives on then, as modules do, is not looked at again: that takes half a second each time.
     """
     yield
     if platform.libc_ver()[0] == "glibc" and memory.now("VmRSS") > 600:
         gc.collect()
+        gc.freeze()
         ctypes.CDLL(None).malloc_trim(0)
 
 

@@ -74,11 +74,11 @@ def make_robust(folder):
     make_dqn(folder)
     path = folder / "run"
     options = ["vehicle", "--policy", folder / "agent.zip", "--preset", "smoke", "--out", path]
-    diagnosed = call("diagnose", *options)
-    assert diagnosed.returncode == 0, diagnosed.stderr
-    before = contents(path)
     with pytest.MonkeyPatch.context() as patch:
         few_replays(patch)
+        diagnosed = call("diagnose", *options)
+        assert diagnosed.returncode == 0, diagnosed.stderr
+        before = contents(path)
         done = call("robustify", *options)
     assert_has_ended(done)
     (folder / "told").write_bytes(pickle.dumps((diagnosed.stdout, before, done.stdout)))
