@@ -20,7 +20,9 @@ from filelock import FileLock
 
 import hyrl_mj
 from hyrl_mj.physics import mjcf
+from hyrl_mj.pipeline import runs
 from hyrl_mj.system import cores
+from hyrl_mj.tasks.checks import check_task
 from hyrl_mj.tasks.scaffold import write_task
 
 # The same examples everywhere, whatever the speed of the machine; `scripts/test --long` tries others, too.
@@ -54,11 +56,12 @@ def memory_of_a_file():
     """What the tests of a file have freed goes back to the system, if it is much: each fork copies less.
 
     The simulations of hundreds of environments are freed in pieces between which others live, and glibc keeps
-    all of it.
+    all of it. What lives on then, as modules do, is not looked at again: that takes half a second each time.
     """
     yield
     if platform.libc_ver()[0] == "glibc" and memory.now("VmRSS") > 600:
         gc.collect()
+        gc.freeze()
         ctypes.CDLL(None).malloc_trim(0)
 
 
@@ -104,6 +107,23 @@ def coarse_looks():
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def tasks_of_the_package_are_checked_once():
+    """Before a run a task is tried out for a second: here those of the package once in each process."""
+    checked = set()
+
+    def check(task):
+        if (kind := type(task)) not in checked:
+            check_task(task)
+        if kind.__module__.startswith("hyrl_mj.tasks."):
+            checked.add(kind)
+        return task
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(runs, "check_task", check)
+        yield
+
+
 @pytest.fixture(scope="session")
 def circle():
     return hyrl_mj.get_task("unit_circle")
@@ -139,17 +159,14 @@ def planted_circle(made_once):
 
     As on a machine that cannot draw: there is no video.
     """
-    from planted import FEW_CELLS, decisions, halves, without_pictures
+    from planted import FEW_CELLS, decisions, halves, without_pictures, without_videos
     from test_report import plant
-
-    def no_renderer(*arguments, **options):
-        raise hyrl_mj.NoRenderer("no GL library here")
 
     def make(folder):
         task, said, path = hyrl_mj.get_task("unit_circle"), [], folder / "unit_circle"
         plant(path, task, decisions(task), halves(task), **FEW_CELLS)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("hyrl_mj.viz.replay.render_replay", no_renderer)
+            without_videos(patch)
             without_pictures(patch)
             hyrl_mj.run("unit_circle", preset="smoke", set=FEW_CELLS, out=path, say=said.append)
         (folder / "said.json").write_text(json.dumps(said))

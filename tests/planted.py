@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image
 
+from hyrl_mj.errors import NoRenderer
 from hyrl_mj.files.artifacts import digest
 from hyrl_mj.files.manifest import FILES, Entry, Manifest
 from hyrl_mj.gym_import import draws, resets, starts, trials, uses
@@ -32,7 +33,7 @@ from hyrl_mj.viz.figures import style
 # Settings of a smoke run on the circle whose worst-case game takes two seconds.
 FEW_CELLS = {"lattice": 130}
 # Settings of the runs of a sweep, which are made in processes that `shorten` does not reach.
-TINY = {"stage1.samples": 4096, "stage6.samples": 4096, "lattice": 130, "rods": 100, "cells": 240}
+TINY = {"stage1.samples": 2048, "stage6.samples": 2048, "lattice": 130, "rods": 100, "cells": 240}
 
 
 def shorten(patch):
@@ -79,6 +80,25 @@ def without_pictures(patch):
         Image.new("RGB", (width, height), "white").save(content, format)
 
     without_pdfs(patch, write)
+
+
+def without_videos(patch):
+    """Patches rendering, as on a machine that cannot draw: there is no video."""
+
+    def no_renderer(*arguments, **options):
+        raise NoRenderer("no GL library here")
+
+    patch.setattr("hyrl_mj.viz.replay.render_replay", no_renderer)
+
+
+def few_replays(patch):
+    """Patches what is replayed of proofs: without noise, and under one kind."""
+    noises = replays._noises
+
+    def few(*arguments):
+        return {k: v for k, v in noises(*arguments).items() if k in ("none", "alternating")}
+
+    patch.setattr(replays, "_noises", few)
 
 
 def spare(patch, **effort):

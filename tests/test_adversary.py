@@ -77,9 +77,8 @@ class Counting(adversary.Lookahead):
         return super()._simulate(begun, past, samples)
 
 
-@pytest.mark.parametrize("levels", [2, 5])
-def test_what_was_simulated_before_is_not_simulated_again(puck, levels):
-    steps = np.linspace(-1, 1, levels)
+def test_what_was_simulated_before_is_not_simulated_again(puck):
+    steps = np.linspace(-1, 1, 2)
     policy = ChartPolicy(
         puck, lambda z: steps[np.abs(steps - np.tanh(9 * z[:, 1:])).argmin(axis=1)][:, None]
     )

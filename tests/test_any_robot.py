@@ -3,23 +3,23 @@
 import json
 import os
 import re
-import subprocess
 import sys
-from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
 from command_line import call
 from gl import needs_gl
+from planted import spare
 from sentences import assert_has_ended
 
 import hyrl_mj
 from hyrl_mj import Outcome
 from hyrl_mj.gym_export.core import BatchedEnv
+from hyrl_mj.judging import examination
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.simulation import WayRuns, way_runs
-from hyrl_mj.tasks import registry
+from hyrl_mj.tasks import registry, trial
 from hyrl_mj.tasks.checks import check_task
 from hyrl_mj.tasks.registry import reference
 from hyrl_mj.tasks.scaffold import TEMPLATES, write_task
@@ -134,21 +134,24 @@ def unknown_tasks(monkeypatch):
     monkeypatch.setattr(registry, "_FILES", {**registry._FILES})
 
 
-def command(*arguments, cwd, path):
-    """Run `hyrl-mj` in a folder, in a process that finds packages in others."""
-    package = str(Path(hyrl_mj.__file__).parents[1])
-    env = {**os.environ, "PYTHONPATH": os.pathsep.join([package, *map(str, path)])}
-    return subprocess.run(
-        [sys.executable, "-m", "hyrl_mj.cli", *map(str, arguments)],
-        cwd=cwd, env=env, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+@pytest.fixture(scope="module", autouse=True)
+def short_trials():
+    """A tenth of the episodes by which a task is tried out."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(trial, "STEPS", trial.STEPS // 10)
+        yield
 
 
 @needs_gl
 @pytest.mark.slow
-def test_a_robot_from_its_own_folder_goes_through_the_whole_pipeline(small_runs, wasp, tmp_path):
+def test_a_robot_from_its_own_folder_goes_through_the_whole_pipeline(
+    small_runs, wasp, tmp_path, monkeypatch
+):
+    spare(monkeypatch, attack_starts=12, attack_rounds=1)
+    monkeypatch.setattr(examination, "usual_kinds", lambda *_: ("none", "uniform"))
     assert len(WASP_PY.strip().splitlines()) <= 90
     words = ("--preset", "smoke", "--set", "rods=8", "cells=14", "lattice=20")
+    words += ("stage1.samples=2048", "stage6.samples=2048")
     done = call("run", os.path.relpath(wasp, tmp_path), *words, cwd=tmp_path)
     assert_has_ended(done)
     out = tmp_path / "runs" / "wasp"
@@ -193,40 +196,29 @@ def test_gymnasium_knows_it(wasp):
     assert reference(hyrl_mj.get_task("wasp")) == str(wasp)
 
 
-USE_INSTALLED = """
-from hyrl_mj import get_task
-from hyrl_mj.tasks import check_task, reference
-
-task = check_task(get_task("wasp"))
-print(reference(task), task.model_path)
-"""
-
-
-@pytest.mark.slow
-def test_an_installed_package_can_offer_tasks(wasp, tmp_path):
+def test_an_installed_package_can_offer_tasks(unknown_tasks, wasp, tmp_path, monkeypatch):
     described = tmp_path / "site" / "wasps-1.0.dist-info"
     described.mkdir(parents=True)
     (described / "METADATA").write_text("Metadata-Version: 2.1\nName: wasps\nVersion: 1.0\n")
     (described / "entry_points.txt").write_text("[hyrl_mj.tasks]\nwasp = wasp:Wasp\n")
-    listed = command("list", cwd=tmp_path, path=[described.parent, wasp.parent])
-    assert listed.returncode == 0, listed.stderr
-    assert re.search(r"^wasp +hyrl_mj/Wasp-v0 +a point mass in space$", listed.stdout, re.M)
-    used = subprocess.run(
-        [sys.executable, "-c", USE_INSTALLED], capture_output=True, text=True, check=False,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(
-            [str(Path(hyrl_mj.__file__).parents[1]), str(described.parent), str(wasp.parent)]
-        )},
-    )  # fmt: skip
-    assert used.returncode == 0, used.stderr
-    assert used.stdout.split() == ["wasp", str(wasp.with_suffix(".xml"))]
-    broken = command("list", cwd=tmp_path, path=[described.parent])
+    registry._REGISTRY.pop("wasp", None)
+    monkeypatch.setattr(registry, "_INSTALLED", set())
+    monkeypatch.delitem(sys.modules, "wasp", raising=False)
+    monkeypatch.syspath_prepend(described.parent)
+    run = call("run", "wasp", cwd=tmp_path)
+    assert run.returncode == 2
+    assert "the task wasp of wasp:Wasp cannot be imported" in run.stderr
+    broken = call("list")
     assert broken.returncode == 0
     assert "the task wasp of wasp:Wasp cannot be imported" in broken.stdout
     assert "vehicle" in broken.stdout
-    assert "Traceback" not in broken.stderr
-    run = command("run", "wasp", cwd=tmp_path, path=[described.parent])
-    assert run.returncode == 2
-    assert "the task wasp of wasp:Wasp cannot be imported" in run.stderr
+    monkeypatch.syspath_prepend(wasp.parent)
+    listed = call("list")
+    assert listed.returncode == 0, listed.stderr
+    assert re.search(r"^wasp +hyrl_mj/Wasp-v0 +a point mass in space$", listed.stdout, re.M)
+    task = check_task(hyrl_mj.get_task("wasp"))
+    assert reference(task) == "wasp"
+    assert task.model_path == wasp.with_suffix(".xml")
 
 
 # ---- a task to start from

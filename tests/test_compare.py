@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from command_line import call
-from planted import FEW_CELLS
+from planted import FEW_CELLS, few_replays, without_videos
 
 import hyrl_mj
 from hyrl_mj import BadInput
@@ -24,6 +24,7 @@ from hyrl_mj.alternatives.smooth import PairedBuffer, SmoothPolicy
 from hyrl_mj.alternatives.timer import TimerSupervisor, returns
 from hyrl_mj.alternatives.training import environment, learned
 from hyrl_mj.files import artifacts
+from hyrl_mj.judging import examination
 from hyrl_mj.judging.game import ReplayCount
 from hyrl_mj.learning.training import export
 from hyrl_mj.pipeline import comparing, steps, sweeping
@@ -33,6 +34,16 @@ from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import LoopSettings, closed_loop
 from hyrl_mj.tasks import Outcome
 from hyrl_mj.viz.compared_tables import ranked, result_table, sentences, tried_table
+
+
+def raises(error):
+    """Returns a function that raises an error, whatever it is given."""
+
+    def function(*arguments, **options):
+        raise error
+
+    return function
+
 
 RUNS = {"preset": "smoke", "set": FEW_CELLS}
 
@@ -292,6 +303,17 @@ def test_an_alternative_gets_the_samples_of_the_whole_run(planted_circle):
     assert given.training().algorithm == s.stage1.algorithm
 
 
+def test_hysteresis_alone_goes_on_beyond_the_decision_of_the_policy(given):
+    (candidate,) = registered()["hysteresis"].candidates(given)
+    ahead, beyond = np.array([[np.pi - 0.5]]), np.array([[np.pi + 0.05]])
+    q = candidate.acts.initial_mode(ahead)
+    u, after = candidate.acts.step(q, beyond)
+    assert after == q
+    assert (
+        np.sign(u) == np.sign(given.run.policy.act(ahead)) != np.sign(given.run.policy.act(beyond))
+    )
+
+
 # ---- the comparison
 
 
@@ -310,27 +332,29 @@ def folder(planted_circle, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def small():
+    """Comparisons with little noise and no video."""
     with pytest.MonkeyPatch.context() as patch:
+        few_replays(patch)
+        without_videos(patch)
         patch.setattr(comparing, "CHOICE_STARTS", 16)
         patch.setattr(comparing, "CHOICE_ROUNDS", 1)
         patch.setattr(comparing, "EPISODES", 64)
-        little = replace(steps.SPARING, episodes=40, attack_starts=12, attack_rounds=1)
+        little = replace(steps.SPARING, episodes=20, attack_starts=12, attack_rounds=1)
         patch.setattr(steps, "SPARING", little)
+        patch.setattr(examination, "usual_kinds", lambda *_: ("none", "uniform"))
         yield
 
 
 @pytest.fixture(scope="module")
 def result(folder, small):
     said = []
-    found = hyrl_mj.compare(
-        "unit_circle", out=folder, only=("held", "hysteresis"), say=said.append, **RUNS
-    )
+    found = hyrl_mj.compare("unit_circle", out=folder, only=("held",), say=said.append, **RUNS)
     return found, said
 
 
 def test_rows_are_made_tuned_and_judged_alike(result, folder, planted_circle):
     found, said = result
-    assert [row.name for row in found.rows] == ["policy", "hyrl", "held", "hysteresis"]
+    assert [row.name for row in found.rows] == ["policy", "hyrl", "held"]
     assert all(row.state == "done" for row in found.rows)
     rows = {row.name: row for row in found.rows}
     assert {*rows["hyrl"].figures} >= {"worst", "lost_quiet", "miss", "variation", "won", "proved"}
@@ -351,10 +375,7 @@ def test_rows_are_made_tuned_and_judged_alike(result, folder, planted_circle):
 
 
 def test_what_is_done_is_not_done_again(result, folder, monkeypatch):
-    def never(*arguments):
-        raise AssertionError("it was made again")
-
-    monkeypatch.setattr(comparing, "judged", never)
+    monkeypatch.setattr(comparing, "judged", raises(AssertionError("it was made again")))
     said = []
     again = hyrl_mj.compare("unit_circle", out=folder, only=("held",), say=said.append, **RUNS)
     assert again == result[0]
@@ -378,16 +399,13 @@ def test_rows_of_other_code_are_made_again(result, circle):
     assert comparing._without_outdated(changed, task, len).rows == ()
 
 
-@pytest.mark.parametrize(
-    "mistake",
-    [Unfit("nothing fits it"), BadInput("nothing fits it"), ValueError("nothing fits it"), None],
-)
-def test_a_file_makes_an_alternative_which_may_not_fit(mistake, result, folder, small, monkeypatch):
+def never(monkeypatch, mistake=None):
+    """Registers, in this test alone, an alternative that ends in a mistake after its first setting."""
     monkeypatch.setattr(base, "_KNOWN", dict(base._KNOWN))
 
     @register
     class Never(Alternative):
-        name, title = f"never-{type(mistake).__name__}", "never"
+        name = title = "never"
 
         def candidates(self, given):
             if mistake is None:
@@ -395,21 +413,33 @@ def test_a_file_makes_an_alternative_which_may_not_fit(mistake, result, folder, 
             yield Candidate("first", given.run.controllers["policy"])
             raise mistake
 
-    says = {ValueError: "it raises ValueError: nothing fits it", type(None): "yields no setting"}
+
+@pytest.mark.parametrize(
+    ("mistake", "says"),
+    [
+        (BadInput("nothing fits it"), "nothing fits it"),
+        (ValueError("nothing fits it"), "it raises ValueError: nothing fits it"),
+        (None, "yields no setting"),
+    ],
+)
+def test_an_alternative_that_makes_a_mistake_is_unfit(mistake, says, planted_circle, monkeypatch):
+    never(monkeypatch, mistake)
+    row = comparing.judged(planted_circle[0], "never", seed=0)
+    assert row.state == "unfit"
+    assert says in row.sentence
+
+
+def test_what_did_not_fit_is_tried_again(result, folder, small, monkeypatch):
+    never(monkeypatch, Unfit("nothing fits it"))
     said = []
     for _ in range(2):  # what did not fit may fit now, as where a package was missing
-        found = hyrl_mj.compare(
-            "unit_circle", out=folder, only=(Never.name,), say=said.append, **RUNS
-        )
-    assert sum(text.startswith(Never.name) for text in said) == 2
-    row = found.row(Never.name, 0)
-    assert row.state == "unfit"
-    assert says.get(type(mistake), "nothing fits it") in row.sentence
-    assert any(row.sentence in sentence for sentence in sentences(found))
+        found = hyrl_mj.compare("unit_circle", out=folder, only=("never",), say=said.append, **RUNS)
+    assert said.count("never: nothing fits it") == 2
+    assert any("nothing fits it" in sentence for sentence in sentences(found))
 
 
 def test_a_name_is_that_of_one_alternative():
-    with pytest.raises(BadInput, match=r"'hyrl' is already hyrl_mj\.alternatives\.of_run\.Hyrl"):
+    with pytest.raises(BadInput, match=r"'hyrl' is already hyrl_mj\.alternatives\.ablation\.Hyrl"):
         register(type("Mine", (Alternative,), {"name": "hyrl", "candidates": None}))
 
 
@@ -432,8 +462,8 @@ def test_an_alternative_cannot_change_the_run_of_the_others(planted_circle, monk
 @pytest.mark.parametrize("lost", [0, 3])
 def test_what_a_replay_refutes_is_not_won(planted_circle, lost):
     result = planted_circle[0].robustness
-    replays = ReplayCount("one", 0.1, False, "proved", {"none": 9}, {"none": lost}, 1, None)
-    game = replace(result.game, scores={"one": result.game.scores["hyrl"]}, replays=(replays,))
+    played = ReplayCount("one", 0.1, False, "proved", {"none": 9}, {"none": lost}, 1, None)
+    game = replace(result.game, scores={"one": result.game.scores["hyrl"]}, replays=(played,))
     found = comparing._shares(replace(result, game=game, attacks=(), comparisons=()))
     assert ("won" in found) == ("proved" in found) == (not lost)
 
@@ -459,7 +489,7 @@ def test_sensors_that_a_task_declares_are_compared_and_not_swept(circle, tmp_pat
 def test_the_page_shows_the_figure_and_the_table(result, folder):
     page = (folder / "compare.html").read_text()
     assert "data:image/png" in page
-    for text in ("hysteresis alone", "inputs held", "How each alternative was tuned"):
+    for text in ("inputs held", "How each alternative was tuned"):
         assert text in page
     assert (folder / "compare.png").stat().st_size > 5_000
 

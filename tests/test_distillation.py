@@ -24,11 +24,10 @@ def settings_of(task, algorithm="ppo"):
     return replace(preset(task, "smoke").stage6, algorithm=algorithm, options={}, hidden=(32, 32))
 
 
-@pytest.mark.parametrize("algorithm", ["ppo", "a2c"])
-def test_a_copy_gives_the_continuous_inputs_of_the_original(circle, algorithm):
+def test_a_copy_gives_the_continuous_inputs_of_the_original(circle):
     policy = homing_policy(circle)
-    copy = distil(circle, policy, circle.starts, settings_of(circle, algorithm), seed=0)
-    assert copy.algorithm == algorithm
+    copy = distil(circle, policy, circle.starts, settings_of(circle, "a2c"), seed=0)
+    assert copy.algorithm == "a2c"
     z = np.r_[np.linspace(0.3, 2.8, 40), np.linspace(3.5, 6.0, 40)][:, None]
     np.testing.assert_allclose(copy.act(z), policy.act(z), atol=0.3)
 

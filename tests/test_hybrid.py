@@ -104,15 +104,6 @@ def test_a_single_mode_never_jumps(vehicle):
         np.testing.assert_array_equal(controller.initial_mode(z), 0)
 
 
-@given(z=states_of("vehicle"))
-def test_flow_and_jump_set_meet_on_the_boundary_only(two, z):
-    flow, jump = two.flow_set(0), two.jump_set(0)
-    distance = flow.signed_distance(z)
-    np.testing.assert_array_equal(distance, -jump.signed_distance(z))
-    np.testing.assert_array_equal(flow.contains(z) & jump.contains(z), distance == 0)
-    assert (flow.contains(z) | jump.contains(z)).all()
-
-
 # ---- a pure function
 
 

@@ -19,7 +19,7 @@ from hyrl_mj.tasks.vehicle import Vehicle
 @pytest.fixture(scope="module")
 def lattices(vehicle):
     """By number of cells."""
-    return {n: Lattice.tabulate(vehicle, Grid.with_cells(vehicle.chart, n)) for n in (60, 240, 480)}
+    return {n: Lattice.tabulate(vehicle, Grid.with_cells(vehicle.chart, n)) for n in (60, 240)}
 
 
 @pytest.fixture(scope="module")
@@ -44,9 +44,8 @@ def some_moves(lattice, n=3000):
 # ---- vehicle: from node to node
 
 
-@pytest.mark.parametrize("cells", [240, 480])
-def test_every_sample_of_the_vehicle_leads_where_the_plant_goes(vehicle, lattices, cells):
-    lattice = lattices[cells]
+def test_every_sample_of_the_vehicle_leads_where_the_plant_goes(vehicle, lattices):
+    lattice = lattices[240]
     assert lattice.exact
     level, node = some_moves(lattice)
     ends, after = stepped(lattice, level, node), lattice.after[level, 0, node]
@@ -137,9 +136,8 @@ def test_the_circle_s_samples_end_between_the_two_nodes_that_they_lead_to(circle
     np.testing.assert_allclose(near[~between], 0, atol=1e-2)
 
 
-@pytest.mark.parametrize("cells", [240, 720])
-def test_neighbouring_levels_lead_a_cell_apart_at_most(circle, cells):
-    lattice = Lattice.tabulate(circle, Grid.with_cells(circle.chart, cells))
+def test_neighbouring_levels_lead_a_cell_apart_at_most(circle):
+    lattice = Lattice.tabulate(circle, Grid.with_cells(circle.chart, 240))
     reach = 2 * 0.05 / lattice.grid.cell  # of one sample, in cells
     assert len(lattice.levels) == int(np.ceil(reach)) + 1
     np.testing.assert_allclose(lattice.levels[[0, -1], 0], [-1, 1])
@@ -180,15 +178,10 @@ def test_a_measurement_of_more_than_the_chart_is_refused():
     assert Lattice.why_not(seeing)
 
 
-def test_the_registered_tasks_can_be_played(task):
-    assert Lattice.why_not(task) is None
-
-
 @pytest.mark.parametrize(
     ("u", "message"),
     [
         ([[0.0], [np.nan]], "[nan] cannot be applied"),
-        ([[0.0], [np.inf]], "[inf] cannot be applied"),
         ([[0.0], [-1.01]], "[-1.01] cannot be applied: the limits of vehicle are [-1.0] to [1.0]"),
         ([[0.0], [0.3]], "[0.3] is not one of the levels of vehicle: [-1.0, -0.5, 0.0, 0.5, 1.0]"),
         ([[0.0, 0.0]], "gives (n, 1) inputs, got (1, 2)"),

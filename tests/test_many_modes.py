@@ -40,12 +40,12 @@ def test_words_on_a_plate_stand_out():
 # ---- figures
 
 
-@pytest.fixture(scope="module", params=[4, 5])
-def shown(request):
+@pytest.fixture(scope="module")
+def shown():
     """A junction of four ways, with names that are long; the fifth mode is the fourth again."""
     task = four_ways()
     task.mode_name = lambda mode: f"{mode} ({LONG})"
-    modes = MANY[: request.param]
+    modes = MANY
     grid = Grid.with_cells(task.chart, 40)
     parts = tuple(GridSet(grid, task.beyond(min(k, 3), grid.nodes)) for k in range(len(modes)))
     sets = tuple(part.dilated(2 * EPS) for part in parts)

@@ -4,7 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from planted import ChartPolicy, decisions, halves, homing_policy, ideal_controller, one_way_policy
+from planted import (
+    ChartPolicy,
+    decisions,
+    halves,
+    homing_policy,
+    ideal_controller,
+    one_way_policy,
+    spare,
+)
 
 from hyrl_mj import Sensor, closed_loop
 from hyrl_mj.gym_export import BatchedEnv
@@ -79,7 +87,7 @@ def discounted(circle, domain, start, u, gamma=0.95):
     return total
 
 
-@pytest.mark.parametrize("eps", [0.05, 0.15, 0.25, 0.29])
+@pytest.mark.parametrize("eps", [0.05, 0.29])
 def test_it_pays_to_go_back_from_the_farthest_edge(circle, eps):
     parts, sets = circle_sets(circle, eps)
     domain = mode_ground(circle, sets, 0, parts).domain(gamma=0.95)
@@ -111,7 +119,7 @@ def test_only_in_its_part_does_a_mode_earn_the_reward_of_the_task(circle):
 )
 def test_the_modes_of_the_circle_settle_as_early_as_can_be_at_any_noise(circle, eps):
     # No controller settles within 0.3 rad of the set-point under greater noise than that.
-    parts, sets = circle_sets(circle, eps, cells=2880)
+    parts, sets = circle_sets(circle, eps, cells=1440)
     settings = preset(circle, "fast", eps=eps).stage6
     first, result = retrain(mode_ground(circle, sets, 0, parts), settings, seed=1)
     second, _ = retrain(
@@ -262,9 +270,8 @@ def test_one_that_will_not_do_is_not_taken(vehicle, vehicle_sets, quick):
 # ---- where the worst case cannot be played
 
 
-# A sixteenth of the usual episodes, and an eighth, which tell more.
-MORE = tuple(n // 8 for n in ModeSettings.batches)
-FEW = tuple(n // 16 for n in ModeSettings.batches)
+# Batches of a few episodes.
+FEW = (4, 4, 8, 16)
 
 
 def by_episodes(puck, sets, mode, policy=None, **changes):
@@ -293,10 +300,10 @@ def round_it(puck, side, clear=0.9):
 
 @pytest.mark.slow
 def test_episodes_tell_policies_apart_and_their_share_is_that_of_the_score(puck, puck_sets):
-    ground = by_episodes(puck, puck_sets, 0)
+    ground = by_episodes(puck, puck_sets, 0, batches=(8, 8))
     wrong = ground(one_way_policy(puck, 1.0))
     assert wrong[0] == 0, "it never comes back to the set-point"
-    assert len(lost_by(ground)) == round(-wrong[1] * FEW[0]) > 0
+    assert len(lost_by(ground)) == round(-wrong[1] * 8) > 0
     # As close as it gets without noise, but not with it.
     grazing = ground(close := round_it(puck, 1.0, clear=0.6))
     assert 0.0 < ground.won(close) < 1.0
@@ -308,20 +315,15 @@ def test_episodes_tell_policies_apart_and_their_share_is_that_of_the_score(puck,
 
 
 @pytest.mark.slow
-def test_a_policy_that_just_survives_the_noise_is_not_good_enough(puck, puck_sets):
-    narrowly = round_it(puck, 1.0, clear=0.705)
-    assert not by_episodes(puck, puck_sets, 0, batches=MORE).suffices(narrowly)
-    assert by_episodes(puck, puck_sets, 0, batches=MORE, margin=1.0).suffices(narrowly)
-
-
-@pytest.mark.slow
-def test_a_policy_that_survives_all_episodes_is_attacked(puck, puck_sets):
-    ground = by_episodes(puck, puck_sets, 0, batches=MORE, margin=1.0)
-    closer = round_it(puck, 1.0, clear=0.685)
-    assert ground(closer) == (len(ground.plays), -1 / 64), "one start of 64 is lost"
-    assert not ground.suffices(closer)
+def test_a_policy_that_just_survives_the_noise_is_attacked_and_not_good_enough(puck, puck_sets):
+    """Under somewhat more noise than the bound, 64 episodes of each kind find nothing, but an attack does."""
+    narrowly, batches = round_it(puck, 1.0, clear=0.66), (64,)
+    ground = by_episodes(puck, puck_sets, 0, batches=batches)
+    assert ground(narrowly) == (len(ground.plays), -1 / 64), "one start of 64 is lost"
+    assert not ground.suffices(narrowly)
     assert len(lost_by(ground)) == 1
-    assert ground.won(closer) == 1 - 1 / 64
+    assert ground.won(narrowly) == 1 - 1 / 64
+    assert by_episodes(puck, puck_sets, 0, batches=batches, margin=1.0).suffices(narrowly)
 
 
 def test_the_judge_s_noise_never_hides_the_chart(puck, puck_sets):
@@ -382,31 +384,24 @@ def test_they_start_where_the_mode_may_be_picked(puck, puck_sets):
     ("text", "noise"),
     [("uniform 0.02 + delay 1", "sensor"), ("uniform 0.02 + bias 0.02", "uniform")],
 )
-def test_modes_are_trained_and_judged_under_what_the_sensor_does(puck, puck_sets, text, noise):
+def test_modes_are_trained_and_judged_under_what_the_sensor_does(
+    puck, puck_sets, text, noise, monkeypatch
+):
+    spare(monkeypatch, checkpoints=2)
     bound, shares = Sensor.parse(text).on(puck)
     task = puck.with_sensor(text, shares)
     sets = replace(puck_sets, eps=bound)
-    ground = by_episodes(task, sets, 0)
+    ground = by_episodes(task, sets, 0, batches=(8,))
     assert ground.noise.kind == noise
     assert {kind for _, kind in ground.plays} == {*KINDS, "sensor"}
-    settings = replace(preset(task, "smoke").stage6, samples=4_096, attempts=1)
+    settings = replace(preset(task, "smoke").stage6, samples=2_048, attempts=1)
     policy, result = retrain(ground, settings, seed=0)
     assert result.attempts == 1
     assert ground(policy) < ground.enough, "so little training does not suffice"
 
 
 @pytest.mark.slow
-def test_a_mirror_image_is_taken_there_too(puck, puck_sets, monkeypatch):
-    settings = replace(preset(puck, "smoke").stage6, samples=4_096)
-    other = training.export(training.build(puck, settings, seed=0), puck)
-    monkeypatch.setattr(ByEpisodes, "judge", lambda *_, **__: Judged((20.0, -1.0), True))
-    found, _ = retrain(by_episodes(puck, puck_sets, 1), settings, seed=0, others=[(other, HALF)])
-    for name, weight in symmetry.mirrored(other).weights.items():
-        np.testing.assert_array_equal(found.weights[name], weight)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("won", "plays", "attacks"), [(0.5, 20, 1), (1.0, 12, 0)])
+@pytest.mark.parametrize(("won", "plays", "attacks"), [(0.5, 16, 1), (1.0, 12, 0)])
 def test_the_image_of_a_policy_that_wins_all_is_judged_by_fewer_episodes(
     puck, puck_sets, monkeypatch, won, plays, attacks
 ):
@@ -428,7 +423,7 @@ def test_the_image_of_a_policy_that_wins_all_is_judged_by_fewer_episodes(
 
 @pytest.mark.slow
 def test_an_image_that_loses_is_not_taken(puck, puck_sets):
-    ground = by_episodes(puck, puck_sets, 0)
+    ground = by_episodes(puck, puck_sets, 0, batches=(8,))
     assert ground.won_by_image(round_it(puck, 1.0), 1.0) == 1.0
     assert ground.won_by_image(round_it(puck, 1.0, clear=0.6), 1.0) is None
 

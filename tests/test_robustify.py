@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from command_line import call, contents
 from gl import needs_gl
-from planted import circle_policy
+from planted import circle_policy, few_replays, without_videos
 from sentences import assert_has_ended
 from stable_baselines3 import DQN, PPO
 from test_agents import onnx_file, rewritten, saved, untrained
@@ -74,10 +74,12 @@ def make_robust(folder):
     make_dqn(folder)
     path = folder / "run"
     options = ["vehicle", "--policy", folder / "agent.zip", "--preset", "smoke", "--out", path]
-    diagnosed = call("diagnose", *options)
-    assert diagnosed.returncode == 0, diagnosed.stderr
-    before = contents(path)
-    done = call("robustify", *options)
+    with pytest.MonkeyPatch.context() as patch:
+        few_replays(patch)
+        diagnosed = call("diagnose", *options)
+        assert diagnosed.returncode == 0, diagnosed.stderr
+        before = contents(path)
+        done = call("robustify", *options)
     assert_has_ended(done)
     (folder / "told").write_bytes(pickle.dumps((diagnosed.stdout, before, done.stdout)))
 
@@ -95,9 +97,12 @@ def dqn(robust):
 
 @pytest.fixture(scope="module")
 def circle_run(small_runs, tmp_path_factory):
-    """A whole run on a function."""
+    """A whole run on a function, but for its video."""
     path = tmp_path_factory.mktemp("runs") / "circle"
-    return hyrl_mj.robustify("unit_circle", off_centre, out=path, **SMOKE)
+    with pytest.MonkeyPatch.context() as patch:
+        few_replays(patch)
+        without_videos(patch)
+        return hyrl_mj.robustify("unit_circle", off_centre, out=path, **SMOKE)
 
 
 # ---- whole runs

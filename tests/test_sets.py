@@ -179,11 +179,6 @@ def test_the_distance_is_continuous_over_the_seam():
     np.testing.assert_allclose(seam, seam[0], atol=1e-6)
 
 
-def test_chart_difference_goes_the_short_way():
-    delta = RING.difference(np.array([[0.1], [6.0], [1.0]]), np.array([[6.0], [0.1], [0.5]]))
-    np.testing.assert_allclose(delta[:, 0], [2 * PI - 5.9, 5.9 - 2 * PI, 0.5])
-
-
 # ---- grids
 
 

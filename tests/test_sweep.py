@@ -12,13 +12,15 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from attacks.crafted_runs import MARKER
 from attacks.doors import plant_modules
 from command_line import call
-from planted import TINY, coarsen, shorten
+from planted import TINY, coarsen, decisions, few_replays, halves, shorten
+from test_report import plant
 
 import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, pipeline
@@ -84,7 +86,9 @@ def test_settings_that_cannot_be_changed(name, value, message, circle):
 
 
 @pytest.mark.slow
-def test_bad_sweeps_make_nothing(tmp_path):
+def test_bad_sweeps_make_nothing(tmp_path, monkeypatch):
+    # Some of them import Ray, which then listens where the sweeps below need it to.
+    monkeypatch.setenv("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
     out = tmp_path / "sweep"
     for tasks, changes, message in (
         ([], {}, "at least one task"),
@@ -101,7 +105,6 @@ def test_bad_sweeps_make_nothing(tmp_path):
         ("unit_circle", {"set": {"latice": 1}}, "Did you mean 'lattice'"),
         ("unit_circle", {"cores": 0}, "cores 0 cannot be used"),
         ("unit_circle", {"memory": -1}, "memory -1 cannot be used"),
-        ("unit_circle", {"memory": 9_999.0}, r"no machine has \d+ core"),
         ("unit_circle", {"address": "nowhere"}, "give HOST:PORT"),
         ("unit_circle", {"address": "127.0.0.1:1"}, "no Ray cluster answers at 127.0.0.1:1"),
         ("unit_circle", {"address": "a..b:1"}, "no Ray cluster answers at a..b:1"),
@@ -109,6 +112,18 @@ def test_bad_sweeps_make_nothing(tmp_path):
         with pytest.raises(BadInput, match=message):
             hyrl_mj.sweep(tasks, out=out, say=str, **{"preset": "smoke", **changes})
         assert not out.exists()
+
+
+def test_runs_for_which_no_machine_has_room_are_refused():
+    nodes = [{"Alive": alive, "Resources": {"CPU": 4, "memory": 2e9}} for alive in (True, False)]
+    ray = SimpleNamespace(nodes=lambda: nodes)
+    assert [cluster.share(ray, runs, None, 1.0) for runs in (1, 2, 9)] == [4, 2, 1]
+    assert cluster.share(ray, 1, 3, 1.0) == 3
+    for wanted, memory in ((5, 1.0), (None, 3.0)):
+        with pytest.raises(
+            BadInput, match=r"no machine has \d cores and \d GB free .*4 and 2\.0 GB"
+        ):
+            cluster.share(ray, 1, wanted, memory)
 
 
 @pytest.mark.parametrize("seeds", ["9-0", "", "a", "1-", "0-9-2", "0-99999999999"])
@@ -209,15 +224,9 @@ def test_runs_without_a_figure_are_counted():
     assert cells == ["HyRL margin", "0.1, none in 2 of 3 runs"]
 
 
-def test_without_ray_one_sentence_says_how_to_install_it(tmp_path):
-    (tmp_path / "ray.py").write_text("raise ImportError('not here')")
-    path = os.pathsep.join((str(tmp_path), os.environ.get("PYTHONPATH", "")))
-    out = tmp_path / "sweep"
-    words = ("sweep", "unit_circle", "--preset", "smoke", "--out", out)
-    done = subprocess.run(
-        [sys.executable, "-m", "hyrl_mj.cli", *words],
-        env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+def test_without_ray_one_sentence_says_how_to_install_it(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    done = call("sweep", "unit_circle", "--preset", "smoke", "--out", tmp_path / "sweep")
     assert done.returncode == 2
     assert done.stderr == (
         'hyrl-mj: sweep needs Ray, which is not installed: pip install "hyrl-mj[sweep]"\n'
@@ -291,6 +300,7 @@ def made_shortly(row, options, *more):
     """Does a run as the processes of a sweep do, but shorter."""
     shorten(patch := pytest.MonkeyPatch())
     coarsen(patch)
+    few_replays(patch)
     return cluster.make(row, options, *more)
 
 
@@ -331,7 +341,7 @@ def test_a_changed_setting_stands_in_the_run_and_in_the_message_about_another(sw
     for name in ("rods", "cells"):  # the others are as in the preset, which is shortened here
         assert f"{name}={TINY[name]}" in commands.beginning(run)
     other = {**TINY, "stage1.samples": 8192}
-    with pytest.raises(BadInput, match=r"stage1\.samples: 4096 there, 8192 given"):
+    with pytest.raises(BadInput, match=r"stage1\.samples: 2048 there, 8192 given"):
         hyrl_mj.run("unit_circle", preset="smoke", set=other, out=run.path)
 
 
@@ -343,25 +353,15 @@ def test_nobody_else_can_reach_it(swept):
     assert swept[3] <= loopback
 
 
-TRAINED = ("train", "critical-set", "partition", "extended-sets", "retrain")
-
-
-def begun(path, settings):
-    """A run directory in which all stages ran that train, in this process."""
-    run = Run(path, changed(settings, TINY))
-    path.mkdir()
-    write_config(run)
-    for stage in TRAINED:
-        run = pipeline.run_stage(run, stage, str)
-    return run
-
-
 @pytest.mark.slow
 def test_a_sweep_makes_the_runs_that_are_made_one_by_one(swept, circle, tmp_path):
     out, result, said, _ = swept
     assert [row.state for row in result.rows] == ["done", "done"]
     assert any("unit_circle-0.1-1" in line and "retrain" in line for line in said)
-    run = begun(tmp_path / "run", replace(preset(circle, "smoke"), seed=1))
+    run = Run(tmp_path, changed(replace(preset(circle, "smoke"), seed=1), TINY))
+    write_config(run)
+    for stage in ("train", "critical-set", "partition", "extended-sets", "retrain"):
+        run = pipeline.run_stage(run, stage, str)
     made = hyrl_mj.load_run(out / "unit_circle-0.1-1")
     names = ("policy.safetensors", "mode_0.safetensors", "mode_1.safetensors")
     for name in (*names, "extended_sets.npz", "critical_set.npz"):
@@ -391,8 +391,7 @@ def test_what_is_done_is_not_done_again_and_tables_are_made_from_what_is_there(s
 
 
 RAYLETS = """
-import os, sys
-os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+import sys
 from ray.cluster_utils import Cluster
 
 quiet = {"num_cpus": 1, "include_dashboard": False, "object_store_memory": 80 * 2**20}
@@ -404,53 +403,47 @@ cluster.shutdown()
 """
 
 
-def parent(process):
-    return int(Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[1])
-
-
-def raylets_at_work(cluster):
-    """The raylets of a cluster that a process started, in whose workers a run is under way."""
-    found = set()
-    for folder in Path("/proc").glob("[0-9]*"):
-        with suppress(OSError):
-            if (folder / "cmdline").read_bytes().startswith(b"ray::make"):
-                raylet = parent(folder.name)
-                # Other tests make sweeps at the same time, with clusters of their own.
-                found |= {raylet} if parent(raylet) == cluster else set()
-    return found
-
-
 @pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="Ray has no clusters elsewhere, nor /proc")
+@pytest.mark.skipif(sys.platform != "linux", reason="Ray has no clusters elsewhere")
 def test_a_cluster_of_two_machines_makes_runs_on_both_and_goes_on_after_one_that_fails(
-    swept, tmp_path
+    swept, tmp_path, monkeypatch
 ):
     """Two of its runs have still to write their pages, and the last one cannot begin."""
     out = shutil.copytree(swept[0], tmp_path / "sweep")
     for page in out.glob("*/report.html"):
-        page.unlink()
+        page.rename(page.with_name("hidden"))
     broken = out / "unit_circle-0.1-2"
     broken.write_text("a file where the run directory should be")
     Sweep(Common("smoke", None, TINY), tuple(Row(CIRCLE, seed) for seed in (0, 1))).save(out)
+
+    def make(row, options, *_):
+        """Finds the page of a run again, while another machine does the same."""
+        import ray
+
+        (options.out / "hidden").rename(options.out / "report.html")
+        (options.out / "where").write_text(ray.get_runtime_context().get_node_id())
+        other = options.out.with_name(f"unit_circle-0.1-{1 - row.seed}") / "where"
+        until = time.monotonic() + 120
+        while not other.exists() and time.monotonic() < until:
+            time.sleep(0.1)
+        return row
+
+    monkeypatch.setattr(cluster, "make", make)
+    # Both listen where this process can reach them, whatever has been imported before.
+    monkeypatch.setenv("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
     pipe = subprocess.PIPE
     with subprocess.Popen(
-        [sys.executable, "-c", RAYLETS], stdin=pipe, stdout=pipe, text=True,
-        env={**os.environ, "MUJOCO_GL": "disable"},
-    ) as two:  # fmt: skip
-        address, raylets = two.stdout.readline().strip(), set()
+        [sys.executable, "-c", RAYLETS], stdin=pipe, stdout=pipe, text=True
+    ) as two:
         words = ["sweep", "unit_circle", "--seeds", "0-2", "--preset", "smoke", "--out", out]
-        words += ["--address", address, "--set", *(f"{k}={v}" for k, v in TINY.items())]
-        command = [sys.executable, "-m", "hyrl_mj.cli", *map(str, words)]
-        with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as sweep:
-            while sweep.poll() is None:
-                raylets |= raylets_at_work(two.pid)
-                time.sleep(0.2)
-            said = sweep.stdout.read() + sweep.stderr.read()
+        words += ["--address", two.stdout.readline().strip()]
+        done = call(*words, "--set", *(f"{k}={v}" for k, v in TINY.items()))
         two.stdin.close()
-    assert sweep.returncode == 1, said
-    assert len(raylets) == 2
+    assert done.returncode == 1, done.stderr
     rows = Sweep.load(out).rows
-    assert [row.state for row in rows] == ["done", "done", "stopped"], said
+    assert [row.state for row in rows] == ["done", "done", "stopped"], done.stdout
+    assert len({path.read_text() for path in out.glob("*/where")}) == 2
     assert str(broken) in rows[2].sentence
 
 
@@ -524,6 +517,7 @@ def doubled(monkeypatch):
 
 @pytest.mark.slow
 def test_episodes_are_the_same_with_a_pool(circle, doubled, monkeypatch):
+    monkeypatch.setattr(type(circle), "max_steps", 20)
     monkeypatch.setattr(episodes, "BATCH", 64)
     count = partial(
         noisy_episodes,
@@ -541,15 +535,17 @@ def test_episodes_are_the_same_with_a_pool(circle, doubled, monkeypatch):
 
 
 @pytest.mark.slow
-def test_modes_are_the_same_with_a_pool(small_runs, doubled, tmp_path):
+def test_modes_are_the_same_with_a_pool(small_runs, doubled, circle, tmp_path):
     """The lopsided circle has no mirror, so that its modes are trained side by side."""
-    task = tmp_path / "lopsided.py"
-    task.write_text(LOPSIDED)
-    shutil.copytree(mjcf.models_dir(), tmp_path, dirs_exist_ok=True)
-    (tmp_path / "unit_circle.xml").rename(tmp_path / "lopsided.xml")
-    plain = begun(tmp_path / "plain", preset(hyrl_mj.get_task(task), "smoke"))
+    path = tmp_path / "lopsided.py"
+    path.write_text(LOPSIDED)
+    shutil.copy(mjcf.models_dir() / "unit_circle.xml", tmp_path / "lopsided.xml")
+    shutil.copytree(mjcf.models_dir() / "common", tmp_path / "common")
+    task = hyrl_mj.get_task(path)
+    few = replace(preset(task, "smoke").stage6, samples=2_048)
+    plain = plant(tmp_path / "plain", task, decisions(circle), halves(circle), stage6=few)
     pooled = hyrl_mj.load_run(shutil.copytree(plain.path, tmp_path / "pooled"))
-    (pooled.path / "mode_0.safetensors").unlink()
+    pipeline.run_stage(plain, "retrain", str)
     with hyrl_mj.using_pool(doubled):
         pipeline.run_stage(pooled, "retrain", str)
     assert doubled.jobs == 2

@@ -1,4 +1,4 @@
-"""HyRL's parts alone: hysteresis without retraining, and retraining without hysteresis."""
+"""What a run has made: its first policy, HyRL, and the parts of HyRL alone."""
 
 from __future__ import annotations
 
@@ -7,9 +7,34 @@ from collections.abc import Iterator
 import numpy as np
 
 from hyrl_mj.alternatives.base import Alternative, Candidate, Given, Unfit, register
+from hyrl_mj.learning import Training
 from hyrl_mj.policies import HybridController
 from hyrl_mj.sets import GridSet
 from hyrl_mj.stages import ExtendedSets, HeldInputs, Partition, part_policies, table_for
+
+
+@register
+class StageOne(Alternative):
+    """The policy of stage 1, trained without noise."""
+
+    name = "policy"
+    title = "RL policy"
+
+    def candidates(self, given: Given) -> Iterator[Candidate]:
+        settings = given.run.settings.stage1
+        samples = settings.samples if isinstance(settings, Training) else 0
+        yield Candidate("as trained", given.run.controllers["policy"], samples)
+
+
+@register
+class Hyrl(Alternative):
+    """The hybrid controller of all stages."""
+
+    name = "hyrl"
+    title = "HyRL"
+
+    def candidates(self, given: Given) -> Iterator[Candidate]:
+        yield Candidate("as made", given.run.controllers["hyrl"], given.samples)
 
 
 @register

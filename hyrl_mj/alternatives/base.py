@@ -11,7 +11,7 @@ import numpy as np
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.learning import Training, preset
-from hyrl_mj.policies import Controller, Policy, PolicyController
+from hyrl_mj.policies import Controller, Policy, as_controller
 from hyrl_mj.runs.directory import Run
 from hyrl_mj.simulation import LoopSettings, Noise, closed_loop
 from hyrl_mj.tasks import Outcome, Task
@@ -19,11 +19,6 @@ from hyrl_mj.tasks import Outcome, Task
 
 class Unfit(BadInput):
     """An alternative does not fit the task, or lacks a package: its row says so, and the others go on."""
-
-
-def as_controller(acts: Controller | Policy) -> Controller:
-    """Returns a controller; a policy alone as one."""
-    return PolicyController(acts) if isinstance(acts, Policy) else acts
 
 
 @dataclass(frozen=True)
@@ -39,11 +34,6 @@ class Candidate:
     label: str
     acts: Controller | Policy
     samples: int = 0
-
-    @property
-    def controller(self) -> Controller:
-        """What closes the loop, as a controller."""
-        return as_controller(self.acts)
 
 
 @dataclass(frozen=True)

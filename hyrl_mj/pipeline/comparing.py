@@ -192,7 +192,7 @@ def _made(made: Run, row: Row) -> Row:
     candidates = [*registered()[row.name].candidates(Given(made.anew(), seed))]
     if not candidates or not all(isinstance(each, Candidate) for each in candidates):
         raise BadInput("candidates() yields no setting: let it yield a Candidate for each")
-    loops = [as_controller(each.controller) for each in candidates]
+    loops = [as_controller(each.acts) for each in candidates]
     one = len(candidates) == 1
     scores = [0.0 if one else _worst(made, loop, seed) for loop in loops]
     number = int(np.argmax(scores))
