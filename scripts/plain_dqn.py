@@ -55,7 +55,7 @@ def main() -> None:
     watch = EvalCallback(
         judged,
         n_eval_episodes=256,
-        eval_freq=max(options.samples // 64 // 40, 1),
+        eval_freq=max(options.samples // 64 // 40, 2),
         best_model_save_path=str(best),
         verbose=0,
         warn=False,

@@ -14,7 +14,7 @@ from hyrl_mj.files.artifacts import digest
 from hyrl_mj.files.manifest import FILES, Entry, Manifest
 from hyrl_mj.gym_import import draws, resets, starts, trials, uses
 from hyrl_mj.gym_import.task import EnvironmentTask
-from hyrl_mj.judging import worst_case as examination
+from hyrl_mj.judging import episodes, worst_case as examination
 from hyrl_mj.judging.proof import cells, counterexamples, replays
 from hyrl_mj.learning import distillation, presets
 from hyrl_mj.pipeline import steps
@@ -48,6 +48,7 @@ def shorten(patch):
     patch.setattr(distillation, "STEPS", 200)
     patch.setattr(counterexamples, "MOST_CELLS", 24)
     patch.setattr(cells, "STATES", 300)
+    patch.setattr(episodes, "JUDGED", 40)
     attack = {"attack_starts": 60, "attack_rounds": 2}
     spare(patch, checkpoints=2, batches=2, nodes=12, episodes=60, **attack)
     spare_environments(patch)

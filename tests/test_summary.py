@@ -3,8 +3,11 @@
 import shutil
 
 import pytest
+from planted import without_pictures
 
 import hyrl_mj
+from hyrl_mj.judging import examination
+from hyrl_mj.judging.game import Maps
 from hyrl_mj.pipeline import ExamineOptions, examine_run
 from hyrl_mj.viz.tables import (
     arrivals,
@@ -30,7 +33,11 @@ def examined(run, tmp_path_factory):
     """A copy with noisy episodes, too."""
     path = tmp_path_factory.mktemp("examined") / "run"
     copy = hyrl_mj.load_run(shutil.copytree(run.path, path))
-    examine_run(copy, ExamineOptions(noise=("uniform",), episodes=40), str)
+    with pytest.MonkeyPatch.context() as patch:  # the game has been played
+        played = run.robustness.game, Maps.load(path / "robustness.npz")
+        patch.setattr(examination, "worst_case", lambda *given: played)
+        without_pictures(patch)
+        examine_run(copy, ExamineOptions(noise=("uniform",), episodes=40), str)
     return hyrl_mj.load_run(copy.path)
 
 
