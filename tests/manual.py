@@ -272,6 +272,7 @@ def shorten() -> None:
     import planted
 
     from hyrl_mj.judging import episodes
+    from hyrl_mj.judging.game import resolution
     from hyrl_mj.judging.proof import counterexamples
     from hyrl_mj.pipeline import comparing, steps
     from hyrl_mj.system import cores
@@ -288,6 +289,8 @@ def shorten() -> None:
     patch.setattr(counterexamples, "MOST_CELLS", 2)
     patch.setattr(counterexamples, "_beaten", few_of(counterexamples._beaten))
     patch.setattr(episodes, "JUDGED", 4)
+    for dimension, few in ((1, 130), (2, 60)):
+        patch.setitem(resolution.CURVE_CELLS, dimension, few)
     patch.setattr(UnitCircle, "max_steps", 40)
     for name, few in (("CHOICE_STARTS", 8), ("CHOICE_ROUNDS", 1), ("EPISODES", 16)):
         patch.setattr(comparing, name, few)
