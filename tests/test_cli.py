@@ -15,6 +15,7 @@ import pytest
 from command_line import call, contents
 from gl import needs_gl
 from PIL import Image
+from planted import played_before
 from sentences import assert_has_ended
 
 import hyrl_mj
@@ -181,7 +182,8 @@ def test_simulate_prints_both_ends(finished):
     assert "hyrl " in done.stdout
 
 
-def test_robustness_prints_the_worst_case_and_the_episodes(copied):
+def test_robustness_prints_the_worst_case_and_the_episodes(copied, monkeypatch):
+    played_before(monkeypatch, hyrl_mj.load_run(copied))
     done = call("robustness", copied, "--episodes", "8", "--noise", "uniform,adversarial")
     assert done.returncode == 0, done.stderr
     for words in (

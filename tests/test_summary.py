@@ -3,11 +3,9 @@
 import shutil
 
 import pytest
-from planted import without_pictures
+from planted import played_before, without_pictures
 
 import hyrl_mj
-from hyrl_mj.judging import examination
-from hyrl_mj.judging.game import Maps
 from hyrl_mj.pipeline import ExamineOptions, examine_run
 from hyrl_mj.viz.tables import (
     arrivals,
@@ -33,9 +31,8 @@ def examined(run, tmp_path_factory):
     """A copy with noisy episodes, too."""
     path = tmp_path_factory.mktemp("examined") / "run"
     copy = hyrl_mj.load_run(shutil.copytree(run.path, path))
-    with pytest.MonkeyPatch.context() as patch:  # the game has been played
-        played = run.robustness.game, Maps.load(path / "robustness.npz")
-        patch.setattr(examination, "worst_case", lambda *given: played)
+    with pytest.MonkeyPatch.context() as patch:
+        played_before(patch, copy)
         without_pictures(patch)
         examine_run(copy, ExamineOptions(noise=("uniform",), episodes=40), str)
     return hyrl_mj.load_run(copy.path)
