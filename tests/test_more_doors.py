@@ -531,12 +531,12 @@ def test_only_colours_and_movements_reach_a_terminal():
     assert not any(_SEQUENCES.fullmatch(text) for text in ("\x1b[6n", "\x1b[c", "\x1b[2J"))
 
 
-@pytest.mark.parametrize("text", [" =1+1", "\u3000@x", "\uff1d1", "=1"])
+@pytest.mark.parametrize("text", [" =1+1", "\u3000@x", "\uff1d1", "=1", "+1+1", "-1+cmd"])
 def test_a_spreadsheet_takes_no_text_for_a_formula(text, tmp_path):
-    sweep_of(row(sentence=text, seconds=1e308)).write_csv(tmp_path)
+    sweep_of(Row(Setting(text, "", 0.1), 0, "stopped", text, text, 1e308)).write_csv(tmp_path)
     with (tmp_path / "sweep.csv").open(newline="", encoding="utf-8") as file:
         (line,) = csv.DictReader(file)
-    assert line["sentence"] == f"'{text}"
+    assert {line[name] for name in ("task", "verdict", "sentence")} == {f"'{text}"}
     assert line["seconds"] == "1e+308"
 
 
