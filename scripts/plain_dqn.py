@@ -39,7 +39,7 @@ def main() -> None:
         gamma=0.9664,
         learning_rate=lambda left: 1e-3 * max(left, 0.02),
         buffer_size=200_000,
-        learning_starts=2_000,
+        learning_starts=min(2_000, options.samples // 2),
         batch_size=256,
         train_freq=1,
         gradient_steps=4,
@@ -55,7 +55,7 @@ def main() -> None:
     watch = EvalCallback(
         judged,
         n_eval_episodes=256,
-        eval_freq=options.samples // 64 // 40,
+        eval_freq=max(options.samples // 64 // 40, 2),
         best_model_save_path=str(best),
         verbose=0,
         warn=False,

@@ -216,9 +216,11 @@ def all_trials(few_trials):
 
 
 # The files that take longest, in this order, each more than half a minute.
-LONGEST = ("docs", "demo", "attack", "environments", "wrapped_environments", "refused_environments")
+LONGEST = ("demo", "attack", "environments", "wrapped_environments", "refused_environments")
 LONGEST += ("starts_of_environments", "trapped_environments", "robustify", "sweep", "retraining")
-LONGEST += ("algorithms", "surroundings", "cli", "report", "training", "tables", "doors")
+LONGEST += ("algorithms", "sensors")
+# The pages of the manual are run with runs that tests of those before have made.
+LONGEST += ("docs", "surroundings", "cli", "report", "training", "tables", "doors")
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -8,15 +8,20 @@ the screen is checked without running it; `SHORTER` and `instead` say how.
 
 import json
 import re
+import runpy
 import shlex
 import shutil
 import subprocess
 import sys
 import time
 import tomllib
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+import pytest
 from planted import TINY
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -27,9 +32,13 @@ SHORTER = {
     'preset="smoke", out="runs/circle_seeds")': f'preset="smoke", out="runs/circle_seeds", set={TINY})',
     'hyrl_mj.run("my_robot.py")': 'hyrl_mj.run("my_robot.py", preset="smoke")',
     "eps=0.1, seed=0)": 'eps=0.1, seed=0, preset="smoke")',
+    "learn(300)": "learn(110)",
 }
 TRAINING = ("run", "robustify", "diagnose", "sweep")
-EPISODES, FRAMES, SIZE = "60", "2", "480x160"
+EPISODES, FRAMES, SIZE = "20", "2", "480x160"
+# What is spent on every task, also with preset smoke.
+EFFORT = {"checkpoints": 2, "batches": 1, "nodes": 6, "episodes": 20}
+EFFORT |= {"attack_starts": 12, "attack_rounds": 1}
 # Scripts that have tests of their own; here their options are looked up.
 TESTED = (
     "scripts/benchmark.py",
@@ -195,12 +204,12 @@ def run_command(words: list[str]) -> None:
         case ["hyrl-mj", *rest]:
             call(shortened(rest))
         case ["python", "scripts/plain_dqn.py", *rest]:
-            script = ROOT / "scripts" / "plain_dqn.py"
-            subprocess.run([sys.executable, script, *rest, "--samples", "2560"], check=True)
+            sys.argv = ["plain_dqn.py", *rest, "--samples", "256"]
+            runpy.run_path(str(ROOT / "scripts" / "plain_dqn.py"), run_name="__main__")
             if Path("made.zip").exists():  # the agent that a test has made robust already
                 shutil.copy("made.zip", rest[0])
         case ["python", "-m", "pytest", *rest]:
-            subprocess.run([sys.executable, "-m", "pytest", "-q", *rest], check=True)
+            assert not pytest.main(["-q", *rest])
         case _:
             raise AssertionError(f"nothing says how to run {shlex.join(words)}")
 
@@ -246,20 +255,58 @@ def agents() -> None:
     onnx.save(onnx.helper.make_model(graph, ir_version=8, opset_imports=opset), "agent.onnx")
 
 
+def few_of(beaten: Callable[..., Any]) -> Callable[..., Any]:
+    """Returns a function that plays a few of the starts that are attacked, and calls the others lost."""
+
+    def played(
+        game: Any, controller: Any, starts: Any, modes: Any, noise: Any, few: int = 8
+    ) -> Any:
+        first = beaten(game, controller, starts[:few], modes[:few], noise)
+        return np.append(first, np.ones(len(starts[few:]), dtype=bool))
+
+    return played
+
+
+def shorten() -> None:
+    """Shortens what is trained and examined in this process and those that it forks."""
+    import planted
+
+    from hyrl_mj.judging import episodes
+    from hyrl_mj.judging.game import resolution
+    from hyrl_mj.judging.proof import counterexamples
+    from hyrl_mj.pipeline import comparing, steps
+    from hyrl_mj.system import cores
+    from hyrl_mj.tasks.unit_circle import UnitCircle
+
+    patch = pytest.MonkeyPatch()
+    # In processes of a pool nothing of this would hold.
+    patch.setattr(cores.Processes, "map", lambda pool, work, jobs: map(work, jobs))
+    planted.shorten(patch)
+    planted.coarsen(patch)
+    planted.spare(patch, **EFFORT)
+    planted.few_trials(patch)
+    patch.setattr(steps, "SPARING", replace(steps.SPARING, **EFFORT))
+    patch.setattr(counterexamples, "MOST_CELLS", 2)
+    patch.setattr(counterexamples, "_beaten", few_of(counterexamples._beaten))
+    patch.setattr(episodes, "JUDGED", 4)
+    for dimension, few in ((1, 130), (2, 60)):
+        patch.setitem(resolution.CURVE_CELLS, dimension, few)
+    patch.setattr(UnitCircle, "max_steps", 40)
+    for name, few in (("CHOICE_STARTS", 8), ("CHOICE_ROUNDS", 1), ("EPISODES", 16)):
+        patch.setattr(comparing, name, few)
+
+
 def main(pages: list[Path]) -> int:
     """Runs pages, each in a process forked from this one, which has imported everything.
 
     Returns the exit status: 1 if a page failed. What happened to each stands in its folder.
     """
-    import planted
-    import pytest
     from attacks import child, small
 
     from hyrl_mj.viz import viewing
 
     small.import_late()
-    planted.shorten(pytest.MonkeyPatch())
-    planted.coarsen(pytest.MonkeyPatch())
+    shorten()
     # A viewer waits for a person, and the loops of a robot for the time to pass.
     viewing.view = lambda *arguments: print("viewed", arguments[1])
     made = child(lambda: call(shortened(["run", "vehicle"])), Path.cwd(), seconds=300)

@@ -16,7 +16,8 @@ from hyrl_mj.files.manifest import FILES, Entry, Manifest
 from hyrl_mj.gym_import import draws, resets, starts, trials, uses
 from hyrl_mj.gym_import.instance import Instance
 from hyrl_mj.gym_import.task import EnvironmentTask
-from hyrl_mj.judging import worst_case as examination
+from hyrl_mj.judging import episodes, examination, worst_case
+from hyrl_mj.judging.game import Maps
 from hyrl_mj.judging.proof import cells, counterexamples, replays
 from hyrl_mj.learning import distillation, presets
 from hyrl_mj.pipeline import steps
@@ -50,6 +51,7 @@ def shorten(patch):
     patch.setattr(distillation, "STEPS", 200)
     patch.setattr(counterexamples, "MOST_CELLS", 24)
     patch.setattr(cells, "STATES", 300)
+    patch.setattr(episodes, "JUDGED", 40)
     attack = {"attack_starts": 60, "attack_rounds": 2}
     spare(patch, checkpoints=2, batches=2, nodes=12, episodes=60, **attack)
     spare_environments(patch)
@@ -114,6 +116,12 @@ def spare_environments(patch):
     patch.setattr(grounds, "ATTACKED", 12)
 
 
+def played_before(patch, run):
+    """Patches the worst-case game of a run: it is not played again, but what is on disk is taken."""
+    played = run.robustness.game, Maps.load(run.path / "robustness.npz")
+    patch.setattr(examination, "worst_case", lambda *given: played)
+
+
 def few_trials(patch):
     """Patches how often an environment is reset and played before it is used.
 
@@ -141,7 +149,7 @@ def few_steps(patch):
 
 def coarsen(patch):
     """Patches what is shown and played: few pixels, few frames, a simple font, few replays of proofs."""
-    patch.setattr(examination, "CURVE", examination.CURVE[::4])
+    patch.setattr(worst_case, "CURVE", worst_case.CURVE[::4])
     patch.setattr(style, "DPI", 60)
     patch.setitem(style.STYLE, "pdf.fonttype", 3)
     few = {"size": (480, 160), "fps": 2}

@@ -19,7 +19,7 @@ def run(vehicle):
     policy, controller = sign_policy(vehicle), ideal_controller(vehicle, clear=1.004)
     return SimpleNamespace(
         task=vehicle,
-        settings=SimpleNamespace(eps=0.1, seed=0, lattice=480),
+        settings=SimpleNamespace(eps=0.1, seed=0, lattice=240),
         controller=controller,
         controllers={"policy": PolicyController(policy), "hyrl": controller},
         critical_set=decisions(vehicle),

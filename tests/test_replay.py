@@ -30,7 +30,7 @@ from hyrl_mj.viz.replay.panel import Panel, Track
 from hyrl_mj.viz.replay.screen import AROUND, HOLD, frame_times
 from hyrl_mj.viz.section import Section
 
-SIZE, FPS = (480, 240), 20
+SIZE, FPS = (480, 240), 10
 TASK = hyrl_mj.get_task("vehicle")
 NOISE = Noise("alternating", 0.1)
 

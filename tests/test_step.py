@@ -96,7 +96,7 @@ def awkward_states(chart, grid, rng):
     low, high = np.array(chart.low), np.array(chart.high)
     ends = np.array(list(product((0.0, 1.0), repeat=chart.dimension))) * (high - low) + low
     ends = np.concatenate([ends, rng.choice([low, high], (50, 1)).reshape(-1, chart.dimension)])
-    beyond = rng.uniform(low - 2 * (high - low), high + 2 * (high - low), (500, chart.dimension))
+    beyond = rng.uniform(low - 2 * (high - low), high + 2 * (high - low), (200, chart.dimension))
     just = [np.nextafter(ends, side) for side in (-np.inf, np.inf)]
     return np.concatenate([grid.nodes, ends, *just, -ends, ends + high - low, beyond])
 
@@ -114,15 +114,10 @@ def controller(task, request):
 # ---- comparisons
 
 
-@pytest.mark.parametrize("where", ["all over", "awkward"])
-def test_a_step_gives_what_a_plain_one_gives(controller, task, where):
+def test_a_step_gives_what_a_plain_one_gives(controller, task):
     rng = np.random.default_rng(0)
-    grid = controller.flow_sets[1].grid
-    z = (
-        random_states(task, 1500, rng)
-        if where == "all over"
-        else awkward_states(task.chart, grid, rng)
-    )
+    awkward = awkward_states(task.chart, controller.flow_sets[1].grid, rng)
+    z = np.concatenate([random_states(task, 300, rng), awkward])
     q = rng.choice(controller.modes, len(z))
     u, q_next = controller.step(q, z)
     plain = [plain_step(controller, mode, row) for mode, row in zip(q, z, strict=True)]

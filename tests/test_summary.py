@@ -3,6 +3,7 @@
 import shutil
 
 import pytest
+from planted import played_before, without_pictures
 
 import hyrl_mj
 from hyrl_mj.pipeline import ExamineOptions, examine_run
@@ -30,7 +31,10 @@ def examined(run, tmp_path_factory):
     """A copy with noisy episodes, too."""
     path = tmp_path_factory.mktemp("examined") / "run"
     copy = hyrl_mj.load_run(shutil.copytree(run.path, path))
-    examine_run(copy, ExamineOptions(noise=("uniform",), episodes=40), str)
+    with pytest.MonkeyPatch.context() as patch:
+        played_before(patch, copy)
+        without_pictures(patch)
+        examine_run(copy, ExamineOptions(noise=("uniform",), episodes=40), str)
     return hyrl_mj.load_run(copy.path)
 
 

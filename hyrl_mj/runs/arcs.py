@@ -52,6 +52,7 @@ def noisy_arcs(
     q0s: Sequence[int | None] = (None,),
     horizon: float | None = None,
     seed: int = 0,
+    game: Game | None = None,
 ) -> dict[str, list[HybridArc]]:
     """Simulates policy and hybrid controller from starts (n, d) under one kind of noise.
 
@@ -64,6 +65,7 @@ def noisy_arcs(
         q0s: start modes of the hybrid controller; with None it picks its start mode.
         horizon: time [s], by default the task's.
         seed: of the noise.
+        game: that of `replay_game` with this bound, where the noise is "worst"; by default a new one.
 
     Returns:
         For each start an arc of "policy", of "hyrl_q0" and so on, and of "hyrl" for a mode of its own.
@@ -82,14 +84,8 @@ def noisy_arcs(
         raise BadInput(f"the noise {noise!r} tells its own bounds: leave eps out")
     bound = task.check_noise(run.settings.eps if eps is None else eps)
     steps = None if horizon is None else samples(task, horizon)
-    game = None
-    if noise == "worst":
-        if why := run.why_no_game:
-            raise BadInput(f"{why}: {EPISODES_INSTEAD}")
-        usual = LATTICE[task.chart.dimension]
-        cells = max(run.settings.lattice or usual, CURVE_CELLS[task.chart.dimension])
-        grid = lattice_grid(task, cells)
-        game = Game(task, run.split, run.controllers, bound, grid=grid)
+    if noise == "worst" and game is None:
+        game = replay_game(run, bound)
     arcs = {}
     for name, loop in run.controllers.items():
         for q0 in q0s if name == "hyrl" else (None,):
@@ -109,6 +105,19 @@ def noisy_arcs(
             key = name if q0 is None else f"{name}_q{q0}"
             arcs[key] = simulate_batch(task, loop, z0, signal, q0, horizon, seed)
     return arcs
+
+
+def replay_game(run: Run, bound: float) -> Game:
+    """Returns the worst-case game whose noise replays show.
+
+    Raises:
+        BadInput: it cannot be played.
+    """
+    if why := run.why_no_game:
+        raise BadInput(f"{why}: {EPISODES_INSTEAD}")
+    d = run.task.chart.dimension
+    cells = max(run.settings.lattice or LATTICE[d], CURVE_CELLS[d])
+    return Game(run.task, run.split, run.controllers, bound, grid=lattice_grid(run.task, cells))
 
 
 @dataclass(frozen=True)
@@ -146,11 +155,15 @@ def replay_arcs(
     starts, modes, seed = replay_starts(run), run.controller.modes, run.settings.seed
     arcs: dict[tuple[str, str], HybridArc] = {}
     strongest = "worst" if run.exact else "alternating"
+    game = None
+    if noise == "worst":  # one game for the starts of the scene and that on M*
+        game = replay_game(run, run.task.check_noise(run.settings.eps if eps is None else eps))
     for on_critical, usual in ((False, "alternating"), (True, strongest)):
         chosen = {name: z for name, z in starts.items() if (name == "critical") == on_critical}
         if chosen:
             z0 = np.array([*chosen.values()], dtype=float)
-            found = noisy_arcs(run, z0, noise or usual, eps, modes, run.task.scene.time, seed)
+            time = run.task.scene.time
+            found = noisy_arcs(run, z0, noise or usual, eps, modes, time, seed, game)
             for who, several in found.items():
                 arcs |= {(start, who): arc for start, arc in zip(chosen, several, strict=True)}
     return arcs

@@ -36,8 +36,8 @@ PICTURE = "drive.png"
 FEW = [f"{name}={value}" for name, value in small.FEW.items()]
 SWEEP = ("sweep", TASK, "--preset", "smoke", "--cores", "1", "--set", *FEW, "--out", "sweep")
 COMMANDS = {
-    "run": RUN,
     "diagnose": ("diagnose", *AGENT),
+    "run": RUN,
     "robustify": ("robustify", *AGENT),
     "drive": ("drive", "field", "--field", "field.json", "--out", PICTURE),
     "sweep": SWEEP,

@@ -17,6 +17,8 @@ from attacks.material import RUN, TASK, Material
 ROOM = 60_000
 # Encoders that do not encode: one of them in each trial.
 BROKEN = {"fails": "exit 1", "writes nothing": "cat > /dev/null", "never reads": "exec sleep 600"}
+# With fewer trials than this no surroundings are tried that only a new process has.
+FEW = 4
 # Files that no surroundings but those of the disk may change.
 TRAINED = ("policy.safetensors", "mode_0.safetensors", "mode_1.safetensors", "robustness.json")
 
@@ -25,6 +27,8 @@ def trials(material: Material, draw: Random, count: int) -> list[Trial]:
     """Returns a trial for each pair, or some of them."""
     material.finished()
     pairs = [pair for pair in combinations(CONDITIONS, 2) if set(pair) not in EITHER]
+    if count < FEW:  # without those that take a new process, which imports everything again
+        pairs = [pair for pair in pairs if not FRESH & set(pair)]
     pairs = pairs if count >= len(pairs) else draw.sample(pairs, count)
     return [
         Trial(

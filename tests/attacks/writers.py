@@ -30,8 +30,8 @@ def trials(material: Material, draw: Random, count: int) -> list[Trial]:
     """Returns rounds: whole runs, stages of a finished run, pages and sweeps, by two and by four."""
     material.finished()
     kinds: list[tuple[str, list[tuple[str, ...]], bool]] = [
-        ("whole runs", [RUN], False),
         ("stages of a finished run", AGAIN, True),
+        ("whole runs", [RUN], False),
         ("reports to one page", PAGES, True),
         ("sweeps", [SWEEP], False),
     ]
