@@ -107,12 +107,6 @@ def test_it_agrees_on_ten_thousand_states(task, exported):
     assert len(np.unique(u)) > 2
 
 
-@pytest.mark.parametrize("n", [1, 7])
-def test_batches_of_any_size(n, task, exported):
-    controller = planted(task)
-    assert_same(controller, exported(controller), random_states(task, n, RNG(2)))
-
-
 @pytest.mark.parametrize("modes", [(1, 4, 7), (1, 4, 6, 9), (0, 1, 3, 7, 32)])
 def test_three_modes_and_more_jump_to_the_deepest(modes, circle, exported):
     controller = planted(circle, modes=modes)
