@@ -74,7 +74,7 @@ def demo(request, tmp_path_factory):
     stages = [*STAGES][: [*STAGES].index("robustness") + 1]
     with pytest.MonkeyPatch.context() as patch:
         leave_out_what_readme_does_not_tell(patch)
-        patch.setattr(runs._run_all, "__defaults__", (stages,))
+        patch.setattr(runs._run_all, "__defaults__", (stages, False))
         hyrl_mj.run(task, out=path, say=str)
     return path
 

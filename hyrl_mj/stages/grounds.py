@@ -344,13 +344,18 @@ class Episodes(ModeGround):
         self._plants = {n: task.plant(n) for n in set(sizes)}
 
     def play(self, policy: Policy, batch: int, kind: str) -> tuple[np.ndarray, np.ndarray]:
-        """Returns which episodes of a batch are won (k,), as the task says, and how far off they end (k,)."""
+        """Returns which episodes of a batch are won (k,), and how far off they end (k,).
+
+        Without noise they have to end at the set-point, under noise they have to survive.
+        """
         rows, task = self.batches[batch], self.task
         settings = LoopSettings(plant=self._plants[len(rows)], vary=True, quiet=True)
         noise, controller = Noise(kind, self.noise.bound), PolicyController(policy)
         starts, seed = self.begins[rows], int(rows[0])
         run = closed_loop(task, controller, starts, noise, seed=seed, settings=settings)
-        return run.outcome == Outcome.REACHED, task.miss(run.path[-1])
+        ends, won = run.path[-1], run.outcome == Outcome.REACHED
+        won = won & task.arrived(ends) if kind == game.NO_NOISE else won
+        return won, task.miss(ends)
 
     def share(self, policy: Policy, plays: Sequence[Play]) -> float:
         """Returns the share of the episodes of plays that a policy wins."""
