@@ -23,6 +23,7 @@ from hyrl_mj.gym_import import inspection
 from hyrl_mj.gym_import.fingerprint import Unknown, fingerprint, is_known
 from hyrl_mj.gym_import.instance import Instance
 from hyrl_mj.gym_import.opening import Description
+from hyrl_mj.gym_import.physics import Physics
 from hyrl_mj.gym_import.specification import EnvironmentSpec
 from hyrl_mj.system.generators import global_state, kept_generators
 
@@ -855,7 +856,7 @@ def test_what_misleads_in_some_runs_only_is_refused_there(name):
 
 
 def fingers(env):
-    return fingerprint(env, env.model, env.data)
+    return fingerprint(env, Physics(env.model, env.data))
 
 
 class Alarmed(Puck):

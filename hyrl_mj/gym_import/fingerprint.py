@@ -27,7 +27,7 @@ import numpy as np
 from gymnasium import spaces
 
 from hyrl_mj.gym_import.opening import layers
-from hyrl_mj.gym_import.physics import Physics
+from hyrl_mj.gym_import.physics import Physics, parts_of_model
 
 # Objects of these modules hold no memory of an environment, or it is in MuJoCo's state.
 PASSED = (
@@ -42,11 +42,6 @@ LIBRARIES = {
 # How deep attributes of attributes are looked at, and how many values at most. What lies beyond cannot be
 # compared, and counts as different.
 DEEPEST, MOST = 10, 100_000
-# Parts of MuJoCo's model that say how it moves, by the first words of their names.
-MOVES = (
-    "qpos", "body_", "jnt_", "dof_", "geom_", "site_", "tendon_", "wrap_", "actuator_", "sensor_", "eq_",
-    "pair_", "exclude_", "numeric_data", "hfield_data", "flex_", "cam_", "key_",
-)  # fmt: skip
 GENERATORS = np.random.Generator, np.random.RandomState, np.random.BitGenerator, random.Random
 PLAIN = (type(None), bool, int, float, complex, str, bytes)
 # The kinds of variables of a class or a module whose values can change.
@@ -81,11 +76,12 @@ class Unknown:
         return known and self.number == getattr(other, "number", None)
 
 
-def fingerprint(env: gym.Env, model: mujoco.MjModel, data: mujoco.MjData) -> Fingerprint:
+def fingerprint(env: gym.Env, physics: Physics) -> Fingerprint:
     """Returns what an environment remembers outside of its state in MuJoCo, by the names of its places."""
-    seen = {id(model), id(data)}
+    seen = {id(physics.model), id(physics.data)}
     found = shared(env, seen)
-    found.update((f"{name} of its model", value) for name, value in of_model(model).items())
+    found.update((f"{name} of its model", value.tobytes()) for name, value in physics.parts.items())
+    found["opt of its model"] = _of_options(physics.model)
     for layer in layers(env):
         _walk(layer, "" if layer is env.unwrapped else type(layer).__name__, found, seen, 0)
     return found
@@ -119,21 +115,13 @@ def shared_variables(env: gym.Env) -> Iterator[tuple[str, Any, str]]:
 
 def of_model(model: mujoco.MjModel) -> dict[str, bytes]:
     """Returns what may be changed in MuJoCo's model, by name."""
-    found = {name: getattr(model, name).tobytes() for name in _parts_of_model()}
+    found = {name: value.tobytes() for name, value in parts_of_model(model).items()}
+    return {**found, "opt": _of_options(model)}
+
+
+def _of_options(model: mujoco.MjModel) -> bytes:
     options = [np.ravel(getattr(model.opt, name)) for name in _options()]
-    return {**found, "opt": np.concatenate(options, dtype=float).tobytes()}
-
-
-@cache
-def _parts_of_model() -> list[str]:
-    model = mujoco.MjModel.from_xml_string("<mujoco/>")
-    return [
-        name
-        for name in dir(model)
-        if name.startswith(MOVES)
-        and not name.endswith(("_rgba", "_matid", "_group"))  # how it looks
-        and isinstance(getattr(model, name), np.ndarray)
-    ]
+    return np.concatenate(options, dtype=float).tobytes()
 
 
 @cache

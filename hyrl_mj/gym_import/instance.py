@@ -240,7 +240,7 @@ class Instance:
 
     def memory(self) -> written.Fingerprint:
         """Returns what it remembers now outside of its state in MuJoCo: attributes, and MuJoCo's model."""
-        return written.fingerprint(self.env, self.model, self.data)
+        return written.fingerprint(self.env, self.physics)
 
     def remembered(self) -> written.Fingerprint:
         """Returns what it remembers now, to compare it: `memory`, and the parts of MuJoCo's state."""

@@ -12,6 +12,11 @@ import numpy as np
 from hyrl_mj.errors import BadInput
 
 STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+# Parts of MuJoCo's model that say how it moves, by the first words of their names.
+MOVES = (
+    "qpos", "body_", "jnt_", "dof_", "geom_", "site_", "tendon_", "wrap_", "actuator_", "sensor_", "eq_",
+    "pair_", "exclude_", "numeric_data", "hfield_data", "flex_", "cam_", "key_",
+)  # fmt: skip
 
 
 class Physics:
@@ -36,6 +41,11 @@ class Physics:
                 size = mujoco.mj_stateSize(self.model, part)
                 found[name], at = np.arange(at, at + size), at + size
         return found
+
+    @cached_property
+    def parts(self) -> dict[str, np.ndarray]:
+        """The parts of the model by name, which show what these hold at any time."""
+        return parts_of_model(self.model)
 
     @cached_property
     def names(self) -> list[str]:
@@ -88,6 +98,17 @@ class Physics:
     def come_back(self) -> None:
         """Puts everything back as it was at `leave`."""
         mujoco.mj_copyData(self.data, self.model, self._kept)
+
+
+def parts_of_model(model: mujoco.MjModel) -> dict[str, np.ndarray]:
+    """Returns the parts of MuJoCo's model that say how it moves and hold anything, by name, as views."""
+    found = {
+        name: getattr(model, name)
+        for name in dir(model)
+        if name.startswith(MOVES)
+        and not name.endswith(("_rgba", "_matid", "_group"))  # how it looks
+    }
+    return {n: part for n, part in found.items() if isinstance(part, np.ndarray) and part.size}
 
 
 def set_pins(env: Any, data: mujoco.MjData, pinned: Mapping[str, Any], name: str) -> None:

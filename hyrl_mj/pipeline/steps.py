@@ -325,4 +325,4 @@ def as_stage(run: Run, name: str, work: Callable[[Run], object]) -> Run:
     # The physics uses all cores: BLAS threads would only wait for them.
     with threadpool_limits(1, user_api="blas"), fresh.manifest.stage(name):
         work(fresh)
-    return run.anew()
+    return fresh.anew()

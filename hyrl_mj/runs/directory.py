@@ -78,9 +78,14 @@ class Run:
         return task
 
     def anew(self) -> Run:
-        """Returns this run, which has read no file yet; its task, about which much is known, is the same."""
+        """Returns this run, which has read no file yet.
+
+        Its task, about which much is known, is the same, and so is an agent that is a function and was tried.
+        """
         run = replace(self)
         vars(run)["task"] = self.task
+        if self.function is not None and "_reopened" in vars(self):
+            vars(run)["_reopened"] = self._reopened
         return run
 
     @cached_property
@@ -114,6 +119,12 @@ class Run:
             return self._load_policy("policy")
         for path in self.policy_files:
             self.manifest.checked(path)
+        return self._reopened
+
+    @cached_property
+    def _reopened(self) -> Policy:
+        """The policy of the agent."""
+        assert self.agent is not None
         seed, function = self.settings.seed, self.function
         return policies.reopen_agent(self.path, self.agent, self.task, seed, function)
 
