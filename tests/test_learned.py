@@ -1,12 +1,14 @@
-"""Tests of runs whose stage 1 has not learned the task."""
+"""Tests of what a run tells before it rests on a policy, or on a task, that does not do what it should."""
 
+import numpy as np
 import pytest
 
 import hyrl_mj
 from hyrl_mj.errors import HyrlError
 from hyrl_mj.judging import Arrivals, failures
 from hyrl_mj.pipeline import runs
-from hyrl_mj.tasks import Outcome
+from hyrl_mj.tasks import Outcome, overlooked
+from hyrl_mj.tasks.scaffold import write_task
 
 
 @pytest.mark.slow
@@ -41,3 +43,28 @@ def test_how_episodes_fail_is_counted(vehicle):
     assert ends == {Outcome.CRASHED: 1_000 - Arrivals.measure(vehicle, Still()).arrived}
     assert ends.total() > 500
     assert nearest > vehicle.close
+
+
+SECOND = '<geom name="obstacle_2" type="cylinder" pos="0.6 0.9 0.1" size="0.2 0.1"/>\n    <site name="set_point"'
+
+
+@pytest.mark.parametrize("forgotten", [False, True])
+def test_a_second_obstacle_of_the_template_is_a_crash_and_a_forgotten_one_is_told(
+    forgotten, tmp_path
+):
+    write_task("two_posts", tmp_path)
+    model, path = tmp_path / "two_posts.xml", tmp_path / "two_posts.py"
+    model.write_text(model.read_text().replace('<site name="set_point"', SECOND, 1))
+    if forgotten:
+        text = path.read_text().replace("in mjcf.obstacles(self.model)", 'in ["obstacle"]')
+        path.write_text(text.replace("(measured[:, 3] > 0) | ", ""))
+    task = hyrl_mj.get_task(path)
+    ends = task.ending(task.placed(np.array([[0.6, 0.9]])).measurement)
+    assert (ends == Outcome.RUNNING) == forgotten
+    said = overlooked(task)
+    assert ("whose puck is " in said and " inside of obstacle_2, as at x " in said) == forgotten
+    assert bool(said) == forgotten
+
+
+def test_no_task_of_the_package_overlooks_an_obstacle():
+    assert not [name for name in hyrl_mj.task_names() if overlooked(hyrl_mj.get_task(name))]

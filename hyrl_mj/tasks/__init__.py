@@ -8,7 +8,7 @@ from importlib import import_module
 from pkgutil import iter_modules
 
 from hyrl_mj.tasks.base import Task, at_levels
-from hyrl_mj.tasks.checks import check_task
+from hyrl_mj.tasks.checks import check_task, overlooked
 from hyrl_mj.tasks.description import (
     SEARCHES,
     SPARING,
@@ -80,6 +80,7 @@ __all__ = [
     "length",
     "number_of",
     "only_post",
+    "overlooked",
     "pattern_of",
     "posts_of",
     "read_only",

@@ -16,8 +16,8 @@ from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.description import SEARCHES, Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.mirrored import try_mirror
 
-# Number of starts that are tried.
-STARTS = 64
+# Number of starts that are tried, and of places at which robot and obstacles may overlap.
+STARTS, OVERLAPS = 64, 512
 LONGEST = 3_600  # time that is shown [s]
 # What the values of a task's attributes may be.
 RULES: dict[str, Rule] = {
@@ -66,6 +66,41 @@ def check_task(task: Task) -> Task:
         line = line_in(error, task.source)
         raise BadInput(f"the task of {where} cannot be used: {brief(error)}{line}") from error
     return task
+
+
+def overlooked(task: Task) -> str:
+    """Returns where `ending` lets a robot go on that is in the middle of an obstacle; "" if nowhere.
+
+    That is where a geom of the robot is as deep inside of one whose name begins with "obstacle" as it is
+    wide. Where contacts only stop a robot no episode comes to such places.
+    """
+    model = task.model
+    obstacles = [model.geom(name).id for name in mjcf.obstacles(model)]
+    moves = model.body_weldid[model.geom_bodyid] != 0
+    meets = model.geom_contype | model.geom_conaffinity  # what only shows meets nothing
+    own = np.setdiff1d(np.flatnonzero(moves & (meets != 0)), obstacles)
+    if not obstacles or not len(own) or model.nmocap or task.abilities.stopped_by_walls:
+        return ""
+    z = task.chart.draw(OVERLAPS, np.random.default_rng(0))
+    plant, data = task.placed(z), mujoco.MjData(model)
+    for i in np.flatnonzero(task.ending(plant.measurement) == Outcome.RUNNING):
+        data.qpos[:] = plant.qpos[i]
+        mujoco.mj_kinematics(model, data)
+        for geom in own:
+            width = model.geom_size[geom][model.geom_size[geom] > 0].min(initial=np.inf)
+            for obstacle in obstacles:
+                deep = -mujoco.mj_geomDistance(model, data, geom, obstacle, 0.0, None)
+                if deep >= width:
+                    name = model.geom(geom).name or f"geom {geom}"
+                    at = ", ".join(
+                        map("{} {:.3g} {}".format, task.chart.names, z[i], task.chart.units)
+                    )
+                    return (
+                        f"ending() lets a robot go on whose {name} is {deep:.2g} m inside of "
+                        f"{model.geom(obstacle).name}, as at {at}: if it is to pass this obstacle, let the "
+                        "episode end there"
+                    )
+    return ""
 
 
 def _check_names(task: Task) -> None:
