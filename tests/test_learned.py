@@ -45,16 +45,17 @@ def test_how_episodes_fail_is_counted(vehicle):
     assert nearest > vehicle.close
 
 
-SECOND = '<geom name="obstacle_2" type="cylinder" pos="0.6 0.9 0.1" size="0.2 0.1"/>\n    <site name="set_point"'
+SECOND = '<geom name="obstacle_2" type="cylinder" pos="0.6 0.9 0.1" size="0.2 0.1"/>'
 
 
 @pytest.mark.parametrize("forgotten", [False, True])
 def test_a_second_obstacle_of_the_template_is_a_crash_and_a_forgotten_one_is_told(
     forgotten, tmp_path
 ):
-    write_task("two_posts", tmp_path)
-    model, path = tmp_path / "two_posts.xml", tmp_path / "two_posts.py"
-    model.write_text(model.read_text().replace('<site name="set_point"', SECOND, 1))
+    name = "a_forgotten_post" if forgotten else "two_posts"
+    write_task(name, tmp_path)
+    model, path = tmp_path / f"{name}.xml", tmp_path / f"{name}.py"
+    model.write_text(model.read_text().replace("<worldbody>", f"<worldbody>{SECOND}", 1))
     if forgotten:
         text = path.read_text().replace("in mjcf.obstacles(self.model)", 'in ["obstacle"]')
         path.write_text(text.replace("(measured[:, 3] > 0) | ", ""))
