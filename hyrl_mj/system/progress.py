@@ -23,19 +23,20 @@ def progress_bar(
     """
     from tqdm import tqdm  # slow to import
 
-    class Lines(tqdm):
-        """Writes a line where others draw a bar."""
-
-        monitor_interval = 0  # no thread that draws what has not changed
-
-        def display(self, msg: str | None = None, pos: int | None = None) -> None:
-            if msg is None:
-                print(self, file=sys.stderr, flush=True)
-
-        def close(self) -> None:
-            self.disable = True
-
     if shown == "lines":
+
+        class Lines(tqdm):
+            """Writes a line where others draw a bar."""
+
+            monitor_interval = 0  # no thread that draws what has not changed
+
+            def display(self, msg: str | None = None, pos: int | None = None) -> None:
+                if msg is None:
+                    print(self, file=sys.stderr, flush=True)
+
+            def close(self) -> None:
+                self.disable = True
+
         known = total is not None or hasattr(work, "__len__")
         return Lines(
             work, label, total, unit=f" {unit}", unit_scale=True, delay=EVERY, mininterval=EVERY,

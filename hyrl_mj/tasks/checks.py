@@ -72,7 +72,7 @@ def overlooked(task: Task) -> str:
     """Returns where `ending` lets a robot go on that is in the middle of an obstacle; "" if nowhere.
 
     That is where a geom of the robot is as deep inside of one whose name begins with "obstacle" as it is
-    wide. Where contacts only stop a robot no episode comes to such places.
+    wide. Where contacts only stop a robot no episode comes to such places. Models with mocap are not asked.
     """
     model = task.model
     obstacles = [model.geom(name).id for name in mjcf.obstacles(model)]
