@@ -90,7 +90,8 @@ def open_everything(path: Path) -> None:
     import sys
 
     run = None
-    results = [n for n, v in vars(Run).items() if isinstance(v, property | cached_property)]
+    found = [n for n, v in vars(Run).items() if isinstance(v, property | cached_property)]
+    results = [name for name in found if not name.startswith("_")]
     try:
         run = hyrl_mj.load_run(path)
         arcs = run.arc_paths()
