@@ -423,6 +423,10 @@ WHOLE = {
     ),
     "any and all": lambda x: np.column_stack([(x > 1).any(axis=1), np.all(x > -1, axis=1)]),
     "argmax": lambda x: np.argmax(x, axis=1) - x.argmin(axis=1),
+    "lists": lambda x: np.stack(
+        [np.min([*x.T], axis=0), np.maximum.reduce([*x.T]), np.linalg.norm([*x.T], axis=0)], axis=1
+    ),
+    "lists of bools": lambda x: np.any([*(x > 1).T], axis=0) ^ np.logical_and.reduce([*(x > 0).T]),
     "norm": lambda x: x / np.linalg.norm(x, axis=1, keepdims=True),
     "norm of rows": lambda x: np.linalg.norm(x[:, :2], axis=1),
     "shapes": lambda x: np.reshape(x, (len(x), 3, 1)).transpose(0, 2, 1).reshape(-1, 3)[:, ::2],

@@ -1,7 +1,7 @@
 """Runs NumPy code on traced arrays, which record the operations from its arguments to its results.
 
-np.empty((len(x), 3)), np.array([x, y]) and np.take(table, x) ignore NumPy's protocols for foreign arrays.
-Replacing them in the module numpy would change the arrays of all threads. So a copy of the code runs, in
+np.empty((len(x), 3)), np.min([x, y], axis=0) and np.take(table, x) ignore NumPy's protocols for foreign
+arrays. Replacing them in the module numpy would change the arrays of all threads. So a copy of the code runs, in
 which the names `np`, `numpy`, `zeros`, ... stand for something else.
 """
 
@@ -19,7 +19,7 @@ import numpy as np
 
 from hyrl_mj.errors import BadInput, brief
 from hyrl_mj.tracing.traced_array import Operation, Program, Traced, apply, take
-from hyrl_mj.tracing.vocabulary import BATCH, Untraceable
+from hyrl_mj.tracing.vocabulary import BATCH, REDUCTIONS, Untraceable
 
 
 def trace(
@@ -68,26 +68,61 @@ def _filled(original: Callable[..., np.ndarray], *args: Any, **kwargs: Any) -> A
     return apply("full", number, shape=array.shape, dtype=array.dtype.name)
 
 
+def _stacked(x: Any) -> Any:
+    """Returns a list with traced values as one array, as NumPy makes of it; anything else as it is."""
+    is_list = isinstance(x, list | tuple) and any(isinstance(part, Traced) for part in x)
+    return np.stack(x) if is_list else x
+
+
 def _converted(original: Callable[..., Any], x: Any, dtype: Any = None, **kwargs: Any) -> Any:
     """Does np.asarray(x), np.array([x, y]) and the like."""
-    if isinstance(x, list | tuple) and any(isinstance(part, Traced) for part in x):
-        x = np.stack(x)
+    x = _stacked(x)
     if not isinstance(x, Traced):
         return original(x, dtype, **kwargs)
     return x.astype(x.dtype if dtype is None else dtype)
+
+
+def _of_list(original: Callable[..., Any], x: Any, *args: Any, **kwargs: Any) -> Any:
+    """Does np.min([x, y], axis=0) and the like."""
+    return original(_stacked(x), *args, **kwargs)
 
 
 def _take(x: Any, indices: Any, *args: Any, **kwargs: Any) -> Any:
     return (take if isinstance(indices, Traced) else np.take)(x, indices, *args, **kwargs)
 
 
-REPLACEMENTS: dict[str, Callable[..., Any]] = {
-    **{name: partial(_filled, getattr(np, name)) for name in ("empty", "zeros", "ones", "full")},
+class _Reducing:
+    """Stands for a ufunc, whose method `reduce` is a function of arrays, as that of np.maximum is np.max."""
+
+    def __init__(self, ufunc: np.ufunc, reduction: Callable[..., Any]) -> None:
+        self._ufunc, self._reduction = ufunc, reduction
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        return self._ufunc(*args, **kwargs)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._ufunc, name)
+
+    def reduce(self, x: Any, axis: Any = 0, **kwargs: Any) -> Any:
+        x = _stacked(x)
+        reduction = self._reduction if isinstance(x, Traced) else self._ufunc.reduce
+        return reduction(x, axis=axis, **kwargs)
+
+
+REDUCING: dict[np.ufunc, Any] = {
+    np.maximum: np.max, np.minimum: np.min, np.add: np.sum, np.multiply: np.prod,
+    np.logical_and: np.all, np.logical_or: np.any,
+}  # fmt: skip
+OF_LISTS = (*(getattr(np, name) for name in REDUCTIONS), np.amax, np.amin, np.mean, np.prod)
+REPLACEMENTS: dict[Any, Callable[..., Any]] = {
+    **{make: partial(_filled, make) for make in (np.empty, np.zeros, np.ones, np.full)},
     **{
-        name: partial(_converted, getattr(np, name))
-        for name in ("array", "asarray", "asanyarray", "ascontiguousarray")
+        convert: partial(_converted, convert)
+        for convert in (np.array, np.asarray, np.asanyarray, np.ascontiguousarray)
     },
-    "take": _take,
+    **{function: partial(_of_list, function) for function in (*OF_LISTS, np.linalg.norm)},
+    **{ufunc: _Reducing(ufunc, reduction) for ufunc, reduction in REDUCING.items()},
+    np.take: _take,
 }
 
 
@@ -104,9 +139,13 @@ class _PrivateCopies:
     def __init__(self) -> None:
         # Original and copy by the id of the original, which is kept so that its id stays its own.
         self._copies: dict[int, tuple[Any, Any]] = {}
-        vars(self._keep(np, ModuleType("numpy"))).update(vars(np), **REPLACEMENTS)
-        for name, replacement in REPLACEMENTS.items():
-            self._keep(getattr(np, name), replacement)
+        for original, replacement in REPLACEMENTS.items():
+            self._keep(original, replacement)
+        for module in (np.linalg, np):
+            view = self._keep(module, ModuleType(module.__name__))
+            vars(view).update(
+                {n: self._copies.get(id(v), (v, v))[1] for n, v in vars(module).items()}
+            )
 
     def _keep(self, original: Any, copy: Any) -> Any:
         self._copies[id(original)] = original, copy
