@@ -1,8 +1,8 @@
 """Runs NumPy code on traced arrays, which record the operations from its arguments to its results.
 
 np.empty((len(x), 3)), np.min([x, y], axis=0) and np.take(table, x) ignore NumPy's protocols for foreign
-arrays. Replacing them in the module numpy would change the arrays of all threads. So a copy of the code runs, in
-which the names `np`, `numpy`, `zeros`, ... stand for something else.
+arrays. Replacing them in the module numpy would change the arrays of all threads. So a copy of the code runs,
+in which the names `np`, `numpy`, `zeros`, ... stand for something else.
 """
 
 from __future__ import annotations
