@@ -1,5 +1,7 @@
 """Tests of what a run tells before it rests on a policy, or on a task, that does not do what it should."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,7 @@ import hyrl_mj
 from hyrl_mj.errors import HyrlError
 from hyrl_mj.judging import Arrivals, failures
 from hyrl_mj.pipeline import runs
-from hyrl_mj.tasks import Outcome, overlooked
+from hyrl_mj.tasks import Outcome, hidden_goal, overlooked
 from hyrl_mj.tasks.scaffold import write_task
 
 
@@ -70,3 +72,21 @@ def test_a_second_obstacle_of_the_template_is_a_crash_and_a_forgotten_one_is_tol
 def test_no_task_of_the_package_overlooks_an_obstacle():
     tasks = [hyrl_mj.get_task(name) for name in hyrl_mj.task_names()]
     assert not [task for task in tasks if task.source is None and overlooked(task)]
+
+
+def test_a_set_point_that_noise_hides_is_told_with_what_would_do(circle):
+    """It moves by 0.05 rad in a sample: beside the set-point it may be by 0.1 rad of noise and that."""
+
+    class Strict(type(circle)):
+        close = 0.12
+
+    class Looking(Strict):  # where its goal is tells its miss alone
+        set_point = None
+        miss = staticmethod(circle.miss)
+
+    for strict in (Strict(), Looking()):
+        said = hidden_goal(strict, 0.1)
+        assert re.search(r"hides up to 0\.1\d* of that, and 0\.15\d* with", said), said
+        assert re.search(r"a close of at least 0\.15, or noise of at most 0\.0\d", said), said
+        assert not hidden_goal(strict, 0.05)
+    assert not hidden_goal(circle, 0.1)

@@ -26,7 +26,7 @@ from hyrl_mj.runs.sweeps import MOST_RUNS
 from hyrl_mj.sets import coarseness
 from hyrl_mj.simulation import Sensor, judge_task
 from hyrl_mj.system.progress import Say
-from hyrl_mj.tasks import Task, check_as_made, check_task, get_task, overlooked
+from hyrl_mj.tasks import Task, check_as_made, check_task, get_task, hidden_goal, overlooked
 from hyrl_mj.viz import beginning
 
 # The paper's bound of the noise.
@@ -237,9 +237,11 @@ def _run_all(run: Run, say: Say, stages: Collection[str] = STAGES, learned: bool
         judge_task(run.task)
     if "robustness" in stages and not run.manifest.is_done("robustness"):
         say(f"the run will be examined {examination_plan(run)}")
-    if not run.manifest.is_done("train") and (hole := overlooked(run.task)):
-        say(hole)
     s = run.settings
+    if not run.manifest.is_done("train"):
+        for caution in (overlooked(run.task), hidden_goal(run.task, s.eps, s.everywhere)):
+            if caution:
+                say(caution)
     if "partition" in stages and not run.manifest.is_done("partition"):
         bounds = run.task.noise_in_chart(s.eps, s.everywhere)
         if sentence := coarseness(run.task.chart, s.cells, bounds):

@@ -8,7 +8,7 @@ from importlib import import_module
 from pkgutil import iter_modules
 
 from hyrl_mj.tasks.base import Task, at_levels
-from hyrl_mj.tasks.checks import check_task, overlooked
+from hyrl_mj.tasks.checks import check_task, hidden_goal, overlooked
 from hyrl_mj.tasks.description import (
     SEARCHES,
     SPARING,
@@ -77,6 +77,7 @@ __all__ = [
     "check_task",
     "described_task",
     "get_task",
+    "hidden_goal",
     "length",
     "number_of",
     "only_post",

@@ -18,6 +18,7 @@ from hyrl_mj.tasks.mirrored import try_mirror
 
 # Number of starts that are tried, and of places at which robot and obstacles may overlap.
 STARTS, OVERLAPS = 64, 512
+NEARER = (0.1, 0.01, 0.001)
 LONGEST = 3_600  # time that is shown [s]
 # What the values of a task's attributes may be.
 RULES: dict[str, Rule] = {
@@ -101,6 +102,43 @@ def overlooked(task: Task) -> str:
                         "episode end there"
                     )
     return ""
+
+
+def hidden_goal(task: Task, eps: float, everywhere: bool = False) -> str:
+    """Returns why noise of a bound may lose a robot at the set-point, whatever way it goes; "" if not.
+
+    Where the set-point is measured the robot is up to the noise away from it. There it may be shown what it
+    likes least, and goes on for a sample.
+    """
+    if type(task).verdict is not Task.verdict or task.ends_well:  # it need not stay there
+        return ""
+    chart, rng = task.chart, np.random.default_rng(0)
+    noise = task.noise_in_chart(1.0, everywhere)
+    hop = task.moves[: chart.dimension] * (noise > 0)
+    box = rng.uniform(-1, 1, (OVERLAPS, chart.dimension))
+    box[::2] = np.sign(box[::2])  # its corners, too
+    goal = task.set_point
+    if goal is None:
+        z = chart.draw(OVERLAPS, rng)
+        for share in NEARER:  # of the chart's sides
+            goal = z[task.miss(z).argmin()]
+            z = np.vstack([goal, goal + share * chart.sides * box])
+
+    def farthest(bound: float, hops: int) -> float:
+        z = chart.wrap(goal + (bound * noise + hops * hop) * box)
+        return float(task.miss(z).max())
+
+    if farthest(eps, 1) <= task.close:
+        return ""
+    bounds = np.linspace(0, eps, 101)
+    kept = [bound for bound in bounds if farthest(bound, 1) <= task.close]
+    less = f", or noise of at most {max(kept):.2g}" if kept else ""
+    return (
+        f"{task.name} has arrived up to {task.close:g} from its set-point (close), and noise of {eps:g} "
+        f"alone hides up to {farthest(eps, 0):.3g} of that, and {farthest(eps, 1):.3g} with what it moves in "
+        "one sample: there it may be lost whatever way it has gone. Give it a close of at least "
+        f"{farthest(eps, 1):.2g}{less}"
+    )
 
 
 def _check_names(task: Task) -> None:
