@@ -2,7 +2,7 @@
 
 import math
 import traceback
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from numbers import Integral, Real
@@ -68,6 +68,11 @@ def has_controls(text: str) -> bool:
 def counted(n: int, noun: str) -> str:
     """Returns "1 jump", "2 jumps"."""
     return f"{n} {noun}{'' if n == 1 else 's'}"
+
+
+def listed(words: Sequence[str]) -> str:
+    """Returns "a, b and c"."""
+    return " and ".join(filter(None, [", ".join(words[:-1]), *words[-1:]]))
 
 
 def unknown(what: str, value: object, allowed: Iterable[str]) -> BadInput:

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from planted import decisions, halves, ideal_controller, sign_policy
 
-from hyrl_mj import BadArtifact, BadInput, Run
+from hyrl_mj import BadArtifact, BadInput, HybridArc, Run
 from hyrl_mj.learning.presets import preset
 from hyrl_mj.policies.controllers import PolicyController
-from hyrl_mj.runs.arcs import noisy_arcs, replay_arcs, replay_starts
+from hyrl_mj.runs.arcs import noisy_arcs, replay_arcs
 from hyrl_mj.viz.shows import replay_shows
 
 
@@ -31,11 +31,22 @@ def run(vehicle):
     )
 
 
-def test_the_starts_are_the_paper_s_and_one_on_the_critical_set(run):
-    starts = replay_starts(run)
-    assert list(starts) == ["start0", "start1", "start2", "start3", "start4", "critical"]
-    np.testing.assert_array_equal([*starts.values()][:5], run.task.scene.starts)
-    np.testing.assert_allclose(starts["critical"], [0, 0])
+def test_the_starts_are_the_paper_s_and_one_on_the_critical_set_that_is_lost(run, monkeypatch):
+    arcs = replay_arcs(run)
+    names = ["start0", "start1", "start2", "start3", "start4", "critical"]
+    assert list(dict.fromkeys(start for start, _ in arcs)) == names
+    found = np.array([arcs[name, "policy"].z[0] for name in names])
+    np.testing.assert_array_equal(found[:5], run.task.scene.starts)
+    np.testing.assert_allclose(found[5], [0, 0])
+    assert arcs["critical", "policy"].outcome == "crashed"
+    # The nearest point of M* is left for one from which the policy is lost.
+    arrives = HybridArc.arrives
+    monkeypatch.setattr(
+        HybridArc, "arrives", lambda arc, task: arc.z[0][0] == 0 or arrives(arc, task)
+    )
+    beyond = replay_arcs(run)["critical", "policy"]
+    assert 0 < beyond.z[0][0] < 0.2
+    assert beyond.outcome == "crashed"
 
 
 def test_all_controllers_meet_the_noise_that_was_asked_for(run):

@@ -144,7 +144,7 @@ def test_the_table_and_the_sentence_tell_what_is_lost(vehicle, examined, capsys)
     said = f"the attack breaks RL policy from {lost[0]} of {won[0]} starts, HyRL from {lost[1]} of {won[1]}"
     assert said in robustness_sentence(run.robustness)
     print_robustness(run)
-    assert "attack, a search for noise on y of up to 0.1 m" in capsys.readouterr().out
+    assert "attack, a search for noise of up to 0.1 m on y" in capsys.readouterr().out
 
 
 def test_the_replay_plays_the_strongest_signals_from_one_start(examined):

@@ -380,7 +380,7 @@ def test_a_run_is_made_for_a_bound_that_covers_the_sensor(late, capsys):
     assert run.task.sensor_shares == (False, True)
     assert covers_sensor(run.task, 0.15005)
     assert not covers_sensor(run.task, 0.149)
-    assert "noise of up to 0.05005 m on x and 0.15005 m on y" in str(run.verdict.reasons)
+    assert "noise of up to 0.05005 m on x, 0.15005 m on y" in str(run.verdict.reasons)
     assert any("within that bound: uniform 0.05" in reason for reason in run.verdict.reasons)
     sensed = run.robustness.game.sensed
     assert [*sensed] == ["policy", "hyrl"]

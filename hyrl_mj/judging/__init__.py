@@ -9,7 +9,7 @@ from hyrl_mj.judging.episodes import NoisyEpisodes, Regions, noisy_episodes
 from hyrl_mj.judging.evidence import VerdictSettings, by_kind
 from hyrl_mj.judging.examination import USUAL, Examination, ExamineOptions, Subject, examine
 from hyrl_mj.judging.results import Arrivals, Kind, ModeResult, Retraining, failures
-from hyrl_mj.judging.sentences import POLICIES, listed, margin_text, mode_sentence, replays_sentence
+from hyrl_mj.judging.sentences import POLICIES, margin_text, mode_sentence, replays_sentence
 from hyrl_mj.judging.verdict import Verdict, Word
 
 __all__ = [
@@ -35,7 +35,6 @@ __all__ = [
     "examine",
     "failures",
     "game",
-    "listed",
     "margin_text",
     "mode_sentence",
     "noisy_episodes",

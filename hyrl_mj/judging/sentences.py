@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from hyrl_mj.errors import counted
@@ -84,8 +82,3 @@ def mode_sentence(task: Task, result: ModeResult) -> str:
     mode = f"the policy of mode {task.mode_name(result.mode)}{POLICIES.get(result.policy, '')}"
     won = "every state tested in" if result.won == 1 else f"{percent(result.won)} of"
     return f"{mode} wins {won} its set, {how}"
-
-
-def listed(words: Sequence[str]) -> str:
-    """Returns "a, b and c"."""
-    return " and ".join(filter(None, [", ".join(words[:-1]), *words[-1:]]))

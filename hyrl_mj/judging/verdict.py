@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 
+from hyrl_mj.errors import listed
 from hyrl_mj.judging.evidence import Sample, VerdictSettings, by_kind, success_rates
 from hyrl_mj.judging.game import NEARLY, NO_NOISE, ReplayCount, Robustness, Score, percent
 from hyrl_mj.judging.results import Arrivals, Retraining
@@ -13,7 +14,6 @@ from hyrl_mj.judging.sentences import (
     NAMES,
     POLICIES,
     comparison_sentence,
-    listed,
     mode_sentence,
     replays_sentence,
     share_sentence,
@@ -133,14 +133,8 @@ class _Case:
     @property
     def noise(self) -> str:
         """The noise of the examination, in words."""
-        eps, everywhere = self.robustness.eps, self.robustness.everywhere
-        where, unit = self.task.noise_on(everywhere)
-        if not self.task.sensor:
-            return f"noise of up to {eps:g} {unit} on {where}"
-        bounds = self.task.noise_in_chart(eps, everywhere)  # of a sensor they differ
-        columns = zip(bounds, self.task.chart.units, self.task.chart.names, strict=True)
-        each = [f"{bound:g} {unit} on {name}" for bound, unit, name in columns if bound]
-        return f"noise of up to {listed(each)}"
+        robustness = self.robustness
+        return f"noise of up to {self.task.noise_text(robustness.eps, robustness.everywhere)}"
 
     @property
     def whole(self) -> str:

@@ -31,6 +31,9 @@ from hyrl_mj.simulation import (
 )
 from hyrl_mj.tasks import Task
 
+# From so many points of M* it is tried whether the policy is lost.
+ON_CRITICAL = 16
+
 
 def from_middle(task: Task, z: np.ndarray) -> np.ndarray:
     """Returns the distances (n,) of chart points (n, d) from the middle of the replay starts."""
@@ -38,10 +41,10 @@ def from_middle(task: Task, z: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.norm(task.chart.difference(z, middle), axis=1))
 
 
-def critical_start(run: Run) -> np.ndarray | None:
-    """Returns the point (d,) of M* that is nearest to the replay starts, or None if M* is empty."""
+def critical_starts(run: Run) -> np.ndarray:
+    """Returns the points (n, d) of M* that are nearest to the replay starts, the nearest first."""
     points = run.critical_set.points
-    return points[from_middle(run.task, points).argmin()] if len(points) else None
+    return points[np.argsort(from_middle(run.task, points), kind="stable")[:ON_CRITICAL]]
 
 
 def noisy_arcs(
@@ -138,34 +141,32 @@ class _Begun:
         return self.controller.step(q, measured)
 
 
-def replay_starts(run: Run) -> dict[str, np.ndarray]:
-    """Returns the replay starts of the task (paper, Section V) and one on M*: (d,) by name."""
-    starts = {f"start{i}": np.array(z) for i, z in enumerate(run.task.scene.starts)}
-    critical = critical_start(run)
-    return starts if critical is None else starts | {"critical": critical}
-
-
 def replay_arcs(
     run: Run, noise: str | None = None, eps: float | None = None
 ) -> dict[tuple[str, str], HybridArc]:
-    """Simulates the replays by start and controller.
+    """Simulates the replays by start and controller: of the scene (paper, Section V), and one on M*.
 
-    By default the noise is the paper's, and on M* the worst where a game decides.
+    By default the noise is the paper's, and on M* the worst where a game decides. The start on M* is one
+    from which the policy is lost then, if there is one near the middle of the scene's starts.
     """
-    starts, modes, seed = replay_starts(run), run.controller.modes, run.settings.seed
+    scene, modes, seed = run.task.scene, run.controller.modes, run.settings.seed
     arcs: dict[tuple[str, str], HybridArc] = {}
     strongest = "worst" if run.exact else "alternating"
     game = None
     if noise == "worst":  # one game for the starts of the scene and that on M*
         game = replay_game(run, run.task.check_noise(run.settings.eps if eps is None else eps))
-    for on_critical, usual in ((False, "alternating"), (True, strongest)):
-        chosen = {name: z for name, z in starts.items() if (name == "critical") == on_critical}
-        if chosen:
-            z0 = np.array([*chosen.values()], dtype=float)
-            time = run.task.scene.time
-            found = noisy_arcs(run, z0, noise or usual, eps, modes, time, seed, game)
-            for who, several in found.items():
-                arcs |= {(start, who): arc for start, arc in zip(chosen, several, strict=True)}
+    starts = np.array(scene.starts, dtype=float)
+    for z0, usual in ((starts, "alternating"), (critical_starts(run), strongest)):
+        if not len(z0):
+            continue
+        found = noisy_arcs(run, z0, noise or usual, eps, modes, scene.time, seed, game)
+        if z0 is starts:
+            names = {f"start{i}": i for i in range(len(starts))}
+        else:
+            arrives = [arc.arrives(run.task) for arc in found["policy"]]
+            names = {"critical": int(np.argmin(arrives))}
+        for who, several in found.items():
+            arcs |= {(start, who): several[i] for start, i in names.items()}
     return arcs
 
 

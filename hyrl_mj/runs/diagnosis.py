@@ -26,7 +26,7 @@ from hyrl_mj.judging.game import (
     worst_signal,
 )
 from hyrl_mj.policies import Policy, PolicyController
-from hyrl_mj.runs.arcs import critical_start, from_middle
+from hyrl_mj.runs.arcs import critical_starts, from_middle
 from hyrl_mj.runs.directory import Run
 from hyrl_mj.sets import GridSet, within_reach
 from hyrl_mj.simulation import HybridArc, Noise, simulate_batch
@@ -136,8 +136,8 @@ def _first_lost(arcs: Iterable[HybridArc]) -> HybridArc | None:
 
 def usual_arc(run: Run) -> HybridArc:
     """Returns a run of the policy under the paper's noise, from M* if there is one."""
-    start, scene, s = critical_start(run), run.task.scene, run.settings
-    z0, noise = scene.starts[0] if start is None else start, Noise("alternating", s.eps)
+    starts, scene, s = critical_starts(run), run.task.scene, run.settings
+    z0, noise = starts[0] if len(starts) else scene.starts[0], Noise("alternating", s.eps)
     (arc,) = simulate_batch(run.task, run.policy, z0, noise, horizon=scene.time, seed=s.seed)
     return arc
 
@@ -147,9 +147,9 @@ def sentences(
 ) -> list[str]:
     """Returns the results in sentences: the critical set, what noise costs and why, the margin, a run."""
     eps, task = robustness.eps, run.task
-    where, unit = task.noise_on(robustness.everywhere)
+    unit = task.noise_on(robustness.everywhere)[1]
     results = [f"it {run.arrivals}", run.critical_set.sentence(task)]
-    noise = f"noise on {where} of up to {eps:g} {unit}"
+    noise = f"noise of up to {task.noise_text(eps, robustness.everywhere)}"
     if robustness.deciding is not None:
         score = robustness.deciding.scores["policy"][-1]
         lost = percent(1 - score.not_broken)

@@ -11,7 +11,7 @@ from typing import Any, Self
 import mujoco
 import numpy as np
 
-from hyrl_mj.errors import BadInput, check_bound
+from hyrl_mj.errors import BadInput, check_bound, listed
 from hyrl_mj.files.artifacts import digest
 from hyrl_mj.physics import mjcf
 from hyrl_mj.physics.plant import Plant, input_limits
@@ -443,10 +443,19 @@ class Task(ABC):
         return task
 
     def noise_on(self, everywhere: bool = False) -> tuple[str, str]:
-        """Returns the chart coordinates that noise acts on, and their unit: "x and y", "m"."""
-        noisy = self.noise_in_chart(1.0, everywhere) > 0
-        units = dict.fromkeys(compress(self.chart.units, noisy))
-        return " and ".join(compress(self.chart.names, noisy)), ", ".join(units)
+        """Returns the chart coordinates that noise acts on, and the unit of its bound: "x and y", "m"."""
+        shares = self.noise_in_chart(1.0, everywhere)
+        units = dict.fromkeys(compress(self.chart.units, shares == shares.max()))
+        return listed([*compress(self.chart.names, shares > 0)]), ", ".join(units)
+
+    def noise_text(self, bound: float, everywhere: bool = False) -> str:
+        """Returns what noise of a bound does to the chart, as "0.1 m on x and y, 0.05 rad on heading"."""
+        shares = self.noise_in_chart(1.0, everywhere)
+        names: dict[str, list[str]] = {}
+        for share, unit, name in zip(shares, self.chart.units, self.chart.names, strict=True):
+            if share:
+                names.setdefault(f"{bound * share:g} {unit}", []).append(name)
+        return ", ".join(f"{size} on {listed(on)}" for size, on in names.items())
 
     def check_noise(self, bound: float, everywhere: bool = False) -> float:
         """Returns the noise bound, if measurements can still tell states apart.

@@ -9,8 +9,8 @@ from types import MappingProxyType
 
 from markupsafe import Markup
 
-from hyrl_mj.errors import BadInput
-from hyrl_mj.judging import POLICIES, listed
+from hyrl_mj.errors import BadInput, listed
+from hyrl_mj.judging import POLICIES
 from hyrl_mj.judging.game import MapClass, Robustness
 from hyrl_mj.learning import Training
 from hyrl_mj.policies import Agent, MlpPolicy
@@ -74,7 +74,8 @@ def render(run: Run) -> str:
         capital=capital,
         modes=[task.mode_name(q) for q in run.controller.modes],
         listed=listed,
-        worst=task.noise_on(bool(robustness and robustness.everywhere)),
+        worst=robustness
+        and "worst noise of up to " + task.noise_text(robustness.eps, robustness.everywhere),
         film=pages.film(run.path / "replay.mp4", FILM, _film_caption(run), has) or NO_VIDEO,
         pictures=pages.pictures(run.path / "figures", has),
         arrivals={who: tables.arrivals(run, arcs, who == "policy") for who in ("policy", "hyrl")}

@@ -186,7 +186,7 @@ def score_table(task: Task, game: GameResult) -> Table:
                 row["latest arrival, own q0"] = f"{own:.2f} s" if score.won else "-"
                 row["latest, any q0"] = f"{some:.2f} s" if score.won_any else "-"
                 excursion = None if who == LIMIT else score.excursion
-                row[f"excursion [{unit}]"] = excursion_text(excursion)
+                row[f"excursion [{miss_unit(task)}]"] = excursion_text(excursion)
             rows.append(row)
     estimated = ", an estimate" if game.estimate else ""
     spacing = " by ".join(f"{round(side, 5)}" for side in game.lattice.spacing)
@@ -214,10 +214,17 @@ def proved_text(share: float | None) -> str:
     return "-" if share is None else percent(share)
 
 
+def miss_unit(task: Task) -> str:
+    """Returns the unit of how far off the set-point a robot is."""
+    own = (
+        task.source is not None and type(task).miss is not Task.miss
+    )  # which may tell metres of angles
+    return "as miss() tells" if own else ", ".join(dict.fromkeys(task.chart.units))
+
+
 def margin_table(task: Task, game: GameResult) -> Table:
     """Returns the margins, and how far off runs end without noise: a row for each controller."""
     _, unit = task.noise_on(game.everywhere)
-    units = ", ".join(dict.fromkeys(task.chart.units))
     rows = [
         {
             "controller": NAMES[who],
@@ -225,7 +232,7 @@ def margin_table(task: Task, game: GameResult) -> Table:
             f"{100 * NEARLY:.0f}% is proved up to noise": margin_text(
                 game.proved_margin[who], unit
             ),
-            f"off the set-point at most, no noise [{units}]": f"{game.miss_without_noise[who]:.3f}",
+            f"off the set-point at most, no noise [{miss_unit(task)}]": f"{game.miss_without_noise[who]:.3f}",
         }
         for who, margin in game.margin.items()
     ]
@@ -270,8 +277,8 @@ def replays_table(task: Task, counts: Sequence[ReplayCount]) -> Table:
             where = f"{_point(np.array(first.start))}{mode}"
             row["first lost"] = f"{first.outcome.replace('_', ' ')} from {where}"
         rows.append(row)
-    where, unit = task.noise_on(counts[0].everywhere)
-    title = f"{task.name}: replays in MuJoCo, noise on {where} of up to {counts[0].eps:g} {unit}"
+    noise = task.noise_text(counts[0].eps, counts[0].everywhere)
+    title = f"{task.name}: replays in MuJoCo, noise of up to {noise}"
     note = (
         "The starts are proved, or no known noise beats them; they lie anywhere in their cells, the weakest "
         'first, in each start mode. "Judged" are those that plain MuJoCo played once more, one by one, with '
@@ -302,7 +309,6 @@ def episode_table(task: Task, counts: Sequence[EpisodeCount]) -> Table:
 
 def attack_table(task: Task, counts: Sequence[AttackCount]) -> Table:
     """Returns from how many starts the attack found a signal that makes controllers lose: a row for each."""
-    where, unit = task.noise_on(counts[0].everywhere)
     rows = []
     for c in counts:
         low, high = (percent(share) for share in c.interval)
@@ -320,7 +326,8 @@ def attack_table(task: Task, counts: Sequence[AttackCount]) -> Table:
             "strongest signal": signal,
         }
         rows.append(row)
-    title = f"{task.name}: attack, a search for noise on {where} of up to {counts[0].eps:g} {unit}"
+    noise = task.noise_text(counts[0].eps, counts[0].everywhere)
+    title = f"{task.name}: attack, a search for noise of up to {noise}"
     note = (
         "Half of the starts lie near the critical set. Every loss has been repeated with its recorded noise "
         "signal. The interval is that of the share. That the attack finds nothing is no proof that there is "

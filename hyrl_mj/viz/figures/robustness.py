@@ -43,9 +43,8 @@ def draw_robustness_map(shown: ShownGame) -> Figure:
     section = shown.section
     names, grid = result.controllers, maps.grid(section.chart)
     draw = _ring if charts.is_ring(section.chart) else _box
-    where, unit = task.noise_on(result.everywhere)
     estimated = ", an estimate" if result.estimate else ""
-    title = f"the worst noise on {where} up to eps = {maps.eps:g} {unit}{estimated}"
+    title = f"the worst noise of up to {task.noise_text(maps.eps, result.everywhere)}{estimated}"
     with style.drawing(1.6 + _panel_height(section.chart), section, title) as figure:
         panels = figure.subplots(1, len(names), squeeze=False).ravel()
         for k in np.unique(np.concatenate([maps.map[name] for name in names])):

@@ -154,9 +154,8 @@ def set_label(mode: int, extended: bool = False) -> str:
 
 
 def noise_label(task: Task, kind: str, eps: float) -> str:
-    """Returns the label of a noise: "alternating noise on y, eps = 0.1 m"."""
-    where, unit = task.noise_on()
-    return f"{kind} noise on {where}, eps = {eps:g} {unit}"
+    """Returns the label of a noise: "alternating noise, 0.1 m on y"."""
+    return f"{kind} noise, {task.noise_text(eps)}"
 
 
 def axis_label(chart: Chart, axis: int) -> str:
