@@ -14,12 +14,16 @@ from hyrl_mj.viz.colours import BAD, INK, OVERLAP, mode_colour
 from hyrl_mj.viz.figures import charts, style
 from hyrl_mj.viz.figures.charts import OUTER
 from hyrl_mj.viz.figures.shown import ShownRun
+from hyrl_mj.viz.tables import NAMED
 
 CORE, GAP = 0.6, 0.05  # the inner radius of the innermost ring, and the gap between rings
 
 
 def draw_extended_sets(shown: ShownRun) -> Figure:
-    """Draws the extended sets and their overlap; in a plane, with an enlargement around M*."""
+    """Draws the extended sets and their overlap; in a plane, with an enlargement around M*.
+
+    Where they are more than can be told apart, each has a panel of its own.
+    """
     task, sets = shown.task, shown.sets
     charts.check_drawable(task)
     horizon = f", T = {sets.horizon:.2g} s" if sets.horizon else ""
@@ -27,6 +31,8 @@ def draw_extended_sets(shown: ShownRun) -> Figure:
     # The nodes (N,) that several sets hold.
     shared = np.asarray(np.sum([members.mask for members in sets.sets], axis=0) > 1)
     ring = charts.is_ring(task.chart)
+    if len(sets.sets) > NAMED and not ring:
+        return _draw_each(shown, shared, title)
     enlarged = not ring and len(shown.critical.points) > 0 and sets.eps > 0
     with style.drawing(5.6, shown.section, title) as figure:
         panels = figure.subplots(1, 1 + enlarged, squeeze=False).ravel()
@@ -40,6 +46,32 @@ def draw_extended_sets(shown: ShownRun) -> Figure:
             (_set_rings if ring else _set_plane)(panel, shown, shared)
         if enlarged:
             _enlarge(panels[0], panels[1], shown)
+        style.legend(figure)
+    return figure
+
+
+def _draw_each(shown: ShownRun, shared: np.ndarray, title: str) -> Figure:
+    """Draws each set of a plane in a panel of its own, and what of it other sets hold, too (N,)."""
+    sets, (width, height) = shown.sets, shown.section.chart.sides
+    rows = -(-len(sets.sets) // style.COLUMNS)
+    panel_height = (
+        0.8 * style.WIDTH / style.COLUMNS * height / width + 0.8
+    )  # labels beside and around
+    with style.drawing(1.5 + rows * panel_height, shown.section, title) as figure:
+        panels = figure.subplots(rows, style.COLUMNS, squeeze=False).ravel()
+        charts.legend_field(panels[0], "in another set, too", OVERLAP, OVERLAP)
+        for i, (panel, members) in enumerate(zip(panels, sets.sets, strict=False)):
+            both = GridSet.from_mask(members.grid, shared & members.mask)
+            charts.region(panel, members, style.mode_tint(i))
+            charts.region(panel, both, OVERLAP)
+            charts.region(panel, members, "none", mode_colour(i), zorder=2)
+            charts.plane(panel, shown.section)
+            charts.dots(panel, shown.critical.points)
+            mode = sets.modes[i]
+            name = f"{style.set_label(mode, extended=True)}, of mode {shown.task.mode_name(mode)}"
+            panel.set_title(name, color=mode_colour(i), fontweight="bold")
+        for panel in panels[len(sets.sets) :]:
+            panel.set_axis_off()
         style.legend(figure)
     return figure
 
