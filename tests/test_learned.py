@@ -11,17 +11,20 @@ from hyrl_mj.judging import Arrivals, failures
 from hyrl_mj.pipeline import runs
 from hyrl_mj.tasks import Outcome, hidden_goal, overlooked
 from hyrl_mj.tasks.scaffold import write_task
+from hyrl_mj.viz import figures
 
 
 @pytest.mark.slow
 def test_a_run_stops_where_stage_1_has_not_learned_unless_told_to_go_on(tmp_path, monkeypatch):
     short = {"stage1.samples": 4_096}
     options = {"set": short, "out": tmp_path / "run", "say": lambda text: None}
+    shown = tmp_path / "run" / "figures" / "arrivals.png"
     for _ in range(2):  # it is not trained twice
         with pytest.raises(
             HyrlError, match=r"has not learned vehicle: its policy arrives from \d+ of 1,000"
         ):
             hyrl_mj.run("vehicle", **options)
+        assert shown.exists()
     monkeypatch.setattr(runs, "_check_learned", None)  # which is not asked
     after = []
 
@@ -41,9 +44,14 @@ def test_how_episodes_fail_is_counted(vehicle):
         def act(self, measured):
             return measured[:, :1] * 0
 
-    ends, nearest = failures(vehicle, Still())
-    assert ends == {Outcome.CRASHED: 1_000 - Arrivals.measure(vehicle, Still()).arrived}
-    assert ends.total() > 500
+    starts, ends, nearest = failures(vehicle, Still())
+    crashed = ends == Outcome.CRASHED
+    assert crashed.sum() == 1_000 - Arrivals.measure(vehicle, Still()).arrived > 500
+    away = np.abs(starts[:, 1])
+    assert away[crashed].max() < away[~crashed].min() + 0.01
+    assert away[~crashed].min() == pytest.approx(0.75, abs=0.01)
+    legend = figures.draw_arrivals(vehicle, starts, ends).axes[0].get_legend_handles_labels()[1]
+    assert legend[-2:] == ["reached (248)", "crashed (752)"]
     assert nearest > vehicle.close
 
 

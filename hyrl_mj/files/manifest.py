@@ -31,7 +31,7 @@ LARGEST = 2**20  # [bytes]; a manifest is read many times
 REMEDY = "remove it, and all stages run again"
 # The names of the files that each stage may write: no other file is ever believed.
 FILES = {
-    "train": r"policy\.(safetensors|json|onnx)|vecnormalize\.npz|arrivals\.json",
+    "train": r"policy\.(safetensors|json|onnx)|vecnormalize\.npz|arrivals\.json|figures/arrivals\.(png|pdf)",
     "critical-set": r"critical_set\.npz",
     "partition": r"partition\.npz",
     "diagnose": r"diagnosis\.html|diagnosis/(robustness\.json|worst\.(npz|mp4)|\w+\.(png|pdf))",
@@ -40,7 +40,7 @@ FILES = {
     "robustness": r"robustness\.(json|npz)|arcs/attack_\w+\.npz|figures/robustness_\w+\.(png|pdf)",
     "simulate": r"arcs/(start\d+|critical)_(policy|hyrl_q\d+)\.npz",
     "simulate --start": r"arcs/latest_\w+\.npz",
-    "figures": r"figures/(?!robustness_)\w+\.(png|pdf)",
+    "figures": r"figures/(?!robustness_|arrivals\.)\w+\.(png|pdf)",
     "replay": r"replay\.(mp4|png)",
     "report": r"report\.html",
 }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -51,18 +50,18 @@ class Arrivals(artifacts.SavedAsJson):
         return Arrivals(int(arrived.sum()), int(missed.sum()), len(arrived))
 
 
-def failures(task: Task, policy: Policy) -> tuple[Counter[Outcome], float | None]:
-    """Returns how the episodes of `Arrivals` end that do not arrive, and how near these come.
+def failures(task: Task, policy: Policy) -> tuple[np.ndarray, np.ndarray, float | None]:
+    """Returns starts and ends of the episodes of `Arrivals`, and how near those come that do not arrive.
 
-    That is the least distance from the set-point on their way [scaled units], None of a task without one.
+    These are chart points (n, d), the `Outcome` (n,) of each, and the least distance from the set-point on
+    their way [scaled units], None of a task without one.
     """
     run = _episodes(task, policy)
-    failed = run.outcome != Outcome.REACHED
-    ends = Counter(Outcome(int(outcome)) for outcome in run.outcome[failed])
     if task.set_point is None:
-        return ends, None
+        return run.path[0], run.outcome, None
+    failed = run.outcome != Outcome.REACHED
     away = [task.chart.distance(z[failed], task.set_point).min(initial=np.inf) for z in run.path]
-    return ends, float(min(away))
+    return run.path[0], run.outcome, float(min(away))
 
 
 def _episodes(task: Task, policy: Policy) -> Rollout:

@@ -26,7 +26,15 @@ from hyrl_mj.runs.sweeps import MOST_RUNS
 from hyrl_mj.sets import coarseness
 from hyrl_mj.simulation import Sensor, judge_task
 from hyrl_mj.system.progress import Say
-from hyrl_mj.tasks import Task, check_as_made, check_task, get_task, hidden_goal, overlooked
+from hyrl_mj.tasks import (
+    Outcome,
+    Task,
+    check_as_made,
+    check_task,
+    get_task,
+    hidden_goal,
+    overlooked,
+)
 from hyrl_mj.viz import beginning
 
 # The paper's bound of the noise.
@@ -264,8 +272,9 @@ def _check_learned(run: Run) -> None:
     if 2 * arrivals.arrived >= arrivals.episodes:
         return
     assert isinstance(settings, Training)
-    ends, nearest = failures(task, run.policy)
-    how = ", ".join(f"{count:,} {outcome.label}" for outcome, count in ends.most_common())
+    _, ends, nearest = failures(task, run.policy)
+    counts = Counter(Outcome(int(end)) for end in ends if end != Outcome.REACHED)
+    how = ", ".join(f"{count:,} {outcome.label}" for outcome, count in counts.most_common())
     near = "" if nearest is None else f", and none comes nearer to the set-point than {nearest:.3g}"
     raise HyrlError(
         f"stage 1 has not learned {task.name}: its policy {arrivals} (the others: {how}{near}). See whether "

@@ -20,6 +20,7 @@ from hyrl_mj.judging import (
     Retraining,
     Subject,
     examine,
+    failures,
     mode_sentence,
 )
 from hyrl_mj.judging.game import Lattice, Limit, Robustness
@@ -69,6 +70,13 @@ def train_stage(run: Run, say: Say) -> None:
     policy.save(run.path / "policy.safetensors")
     arrivals.save(run.path / "arrivals.json")
     say(f"a policy of {sum(w.size for w in policy.weights.values())} weights {arrivals}")
+    if arrivals.arrived < arrivals.episodes:
+        from hyrl_mj.viz.figures import charts, draw_arrivals, style
+
+        if charts.drawable(run.task.chart):
+            path = run.path / "figures" / "arrivals.png"
+            style.write(draw_arrivals(run.task, *failures(run.task, policy)[:2]), path)
+            say(f"{path} shows from where it does not arrive")
 
 
 def critical_set_stage(run: Run, say: Say) -> None:

@@ -74,10 +74,10 @@ class Section:
     @cached_property
     def over(self) -> GridSet | None:
         """The points at which a run ends without success, with a smooth outline; None if there are none."""
-        grid = Grid.with_cells(self.chart, 240)
+        grid = Grid.with_cells(self.chart, 480)
         over = self.failed(grid.nodes).reshape(grid.counts)
         # Blurred, the mask has a smooth outline where it is one half, without the steps of its cells.
-        blurred = gaussian_filter(over.astype(float), 1.5, mode="nearest")
+        blurred = gaussian_filter(over.astype(float), 4, mode="nearest")
         return GridSet(grid, 0.5 - blurred.ravel()) if over.any() else None
 
     # ---- results in the section

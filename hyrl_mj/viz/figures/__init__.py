@@ -16,7 +16,11 @@ from hyrl_mj.tasks import Task
 from hyrl_mj.viz.figures import style
 from hyrl_mj.viz.figures.charts import drawable
 from hyrl_mj.viz.figures.extended_sets import draw_extended_sets
-from hyrl_mj.viz.figures.policy import draw_overview, draw_policy_map
+from hyrl_mj.viz.figures.policy import (
+    draw_arrivals as draw_arrivals,
+    draw_overview,
+    draw_policy_map,
+)
 from hyrl_mj.viz.figures.robustness import (
     CLASS_COLOURS as CLASS_COLOURS,
     draw_robustness_curve,

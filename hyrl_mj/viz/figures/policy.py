@@ -12,13 +12,23 @@ from matplotlib.figure import Figure
 
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages import Partition
-from hyrl_mj.tasks import Task
-from hyrl_mj.viz.colours import BAD, INK, OBSERVED, PALE, POLICY
+from hyrl_mj.tasks import Outcome, Task
+from hyrl_mj.viz.colours import BAD, INK, MODES, OBSERVED, OPEN, PALE, POLICY
 from hyrl_mj.viz.figures import charts, runs, style
 from hyrl_mj.viz.figures.charts import INNER, OUTER
 from hyrl_mj.viz.figures.runs import CORE, View
 from hyrl_mj.viz.figures.shown import ShownPolicy
+from hyrl_mj.viz.section import Section
 from hyrl_mj.viz.tables import NAMED
+
+ENDS = {
+    Outcome.RUNNING: OPEN,
+    Outcome.REACHED: PALE,
+    Outcome.CRASHED: BAD,
+    Outcome.OUT_OF_BOUNDS: MODES[1],
+    Outcome.STALLED: MODES[0],
+    Outcome.UNSTABLE: INK,
+}
 
 
 def draw_overview(shown: ShownPolicy) -> Figure:
@@ -124,6 +134,31 @@ def _noisy_run(panel: Axes, shown: ShownPolicy, view: View) -> None:
     measured = task.z(arc.measured[:-1])
     runs.line(panel, view, arc.t[:-1], measured, label="what it observes", **looks)
     runs.end(panel, task, view, arc)
+
+
+# ---- where it does not arrive
+
+
+def draw_arrivals(task: Task, starts: np.ndarray, outcomes: np.ndarray) -> Figure:
+    """Draws starts (n, d) of episodes without noise, in the colour of how each ends: `outcomes` (n,)."""
+    charts.check_drawable(task)
+    section = Section(task)
+    with style.drawing(6.4, task, "from where the policy arrives without noise") as figure:
+        panel = figure.subplots()
+        if charts.is_ring(task.chart):
+            charts.ring(panel, task.chart, (OUTER, INNER))
+            radii = np.linspace(INNER, OUTER, len(starts))  # side by side, so that each is seen
+            points = radii[:, None] * np.stack(charts.on_ring(task.chart, starts[:, 0]), axis=1)
+        else:
+            charts.plane(panel, section)
+            points = section.chart.wrap(starts[:, :2])
+        for outcome in np.unique(outcomes):  # failures above
+            of = outcomes == outcome
+            end = Outcome(int(outcome))
+            label = f"{end.label.replace('_', ' ')} ({of.sum():,})"
+            panel.plot(*points[of].T, ".", color=ENDS[end], label=label, zorder=3)
+        style.legend(figure)
+    return figure
 
 
 # ---- the map of the inputs
