@@ -107,7 +107,7 @@ def test_what_is_lost_without_noise_is_said_first(tmp_path, circle, monkeypatch)
     hyrl_mj.diagnose("unit_circle", still, out=tmp_path / "still", preset="smoke", say=said.append)
     lines = [line.removeprefix("diagnose: ") for line in said]
     first = next(i for i, line in enumerate(lines) if line.startswith("without noise it loses"))
-    assert all("noise on theta" not in line for line in lines[:first])
+    assert all("on theta are known" not in line for line in lines[:first])
     assert any("lost nodes without noise, too" in line for line in lines)
     assert any(line.endswith("under worst noise, and without noise, too") for line in lines)
     assert not any("closer than the noise" in line for line in lines)
@@ -125,7 +125,7 @@ def test_what_is_said_is_on_the_page(diagnosed):
     margin = {"unit_circle": "0.02", "vehicle": "0 m"}[run.task.name]
     for words in (
         "critical set of 1 piece",
-        f"signals of noise on {name} of up to 0.1 {unit} are known that make it lose",
+        f"signals of noise of up to 0.1 {unit} on {name} are known that make it lose",
         f"it wins all of them up to noise {margin}",
         "under worst noise",
     ):
