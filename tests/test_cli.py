@@ -19,8 +19,10 @@ from planted import played_before
 from sentences import assert_has_ended
 
 import hyrl_mj
-from hyrl_mj import cli
+from hyrl_mj import BadInput, cli
+from hyrl_mj.judging.game import MapClass, Maps
 from hyrl_mj.pipeline.steps import STAGES
+from hyrl_mj.runs.arcs import noisy_arcs
 from hyrl_mj.viz.figures import FIGURES
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("small_runs")]  # whole runs
@@ -62,6 +64,19 @@ def test_run_ends_with_a_table_and_leaves_every_artifact(finished):
     assert [n for n in names if not (path / n).is_file()] == []
     assert not list(path.rglob("*.partial*"))
     assert f"report {path / 'report.html'}" in said
+
+
+def test_a_run_tells_from_which_starts_a_controller_is_lost(finished):
+    run = hyrl_mj.load_run(finished[0])
+    lost = run.lost("policy")
+    assert lost.shape == (len(lost), 1)
+    maps = Maps.load(finished[0] / "robustness.npz")
+    assert len(lost) <= (maps.map["policy"] == MapClass.BEATEN).sum()
+    if len(lost):  # what is told is lost under the signal that `simulate` plays
+        arc = noisy_arcs(run, lost[:1], "worst")["policy"][0]
+        assert not arc.arrives(run.task)
+    with pytest.raises(BadInput, match="unknown controller 'best': choose one of policy, hyrl"):
+        run.lost("best")
 
 
 @needs_gl

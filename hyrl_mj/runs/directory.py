@@ -13,14 +13,15 @@ from importlib.metadata import version
 from pathlib import Path
 
 import mujoco
+import numpy as np
 
 from hyrl_mj import policies
-from hyrl_mj.errors import BadArtifact, BadInput
+from hyrl_mj.errors import BadArtifact, BadInput, unknown
 from hyrl_mj.fields import acting_policy
 from hyrl_mj.files import artifacts
 from hyrl_mj.files.manifest import FILES, Manifest, check_contents, locked, may_hold
 from hyrl_mj.judging import Arrivals, Retraining, Verdict
-from hyrl_mj.judging.game import Lattice, Robustness, lattice_grid
+from hyrl_mj.judging.game import Lattice, MapClass, Maps, Robustness, lattice_grid
 from hyrl_mj.judging.proof import why_no_cells
 from hyrl_mj.learning import Settings, differing
 from hyrl_mj.policies import Agent, AnyPolicy, HybridController, MlpPolicy, Policy
@@ -322,6 +323,29 @@ class Run:
         paths = {name: self.attack_path(name) for name in ("policy", "hyrl")}
         has = [self.manifest.has(path) for path in paths.values()]
         return {name: self.arc(path) for name, path in paths.items()} if all(has) else {}
+
+    def lost(self, controller: str = "policy") -> np.ndarray:
+        """Returns the starts (n, d) from which a controller is known to be lost under the noise of the run.
+
+        Where the worst-case game decides these are nodes of its lattice that may be starts. Elsewhere it is
+        the start of the strongest signal of the attack, if that is lost. `hyrl-mj simulate RUN --start ...
+        --noise worst` (or attack) plays the signal.
+
+        Args:
+            controller: "policy" or "hyrl".
+
+        Raises:
+            BadInput: there is no such controller, or the run has not been examined.
+        """
+        if controller not in self.controllers:
+            raise unknown("controller", controller, self.controllers)
+        if self.robustness.deciding is None:
+            arc = self.attack_arcs().get(controller)
+            found = [] if arc is None or arc.arrives(self.task) else [arc.z[0]]
+            return np.reshape(found, (-1, self.task.chart.dimension))
+        maps = Maps.load(self._checked("robustness.npz"))
+        z = maps.grid(self.task.chart).nodes
+        return z[(maps.map[controller] == MapClass.BEATEN) & self.task.may_start(z)]
 
     def latest_path(self, controller: str) -> Path:
         """Returns the file of the latest simulation from the user's own start."""
