@@ -459,6 +459,19 @@ def test_a_plant_that_moves_states_differently_is_refused(vehicle):
         Cells.cover(lattice)
 
 
+def test_an_end_at_a_node_that_was_not_followed_is_noticed(vehicle):
+    class Spot(type(vehicle)):
+        def ending(self, measurement):
+            ends = super().ending(measurement)
+            if type(measurement) is np.ndarray:
+                ends[(np.abs(measurement - [2.4, 0.8]) < 1e-3).all(axis=1)] = Outcome.CRASHED
+            return ends
+
+    lattice = Lattice.tabulate(Spot(), Grid.with_cells(vehicle.chart, 60))
+    with pytest.raises(Unbounded, match=r"ending of .* another result at x = 2\.4 m, y = 0\.8 m"):
+        Cells.cover(lattice)
+
+
 def test_a_chart_that_is_not_the_position_is_refused(vehicle):
     class Moved(type(vehicle)):
         def z(self, measured):

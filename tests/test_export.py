@@ -5,8 +5,10 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from runpy import run_path
 from types import ModuleType
@@ -311,9 +313,33 @@ def with_method(task, name, method):
     return type(task.name, (type(task),), {name: lambda self, measured: method(measured)})()
 
 
+def through_a_part(x, taken, written):
+    """Writes to a part of an array and reads the whole, or the other way round."""
+    whole = np.hstack([x, x])
+    part = taken(whole)
+    (part if written == "part" else whole)[...] = 1.0
+    return whole if written == "part" else part + 1.0
+
+
+def quietly(x):
+    seen = np.hstack([np.cos(x), np.sin(x)])
+    with suppress(Exception):
+        if (x > 6.2).any(axis=1):
+            seen = 0 * seen
+    return seen
+
+
+PART = "writes to an array of which a part has a name of its own"
+
+
 @pytest.mark.parametrize(
     ("method", "said"),
     [
+        *((lambda x, how=how: through_a_part(x, *how), PART) for how in product(
+            (lambda a: a[:, :1], lambda a: a.reshape(-1, 1, 2), lambda a: a.T, lambda a: a[None][:, :, 0]),
+            ("part", "whole"),
+        )),
+        (quietly, "branches on values"),
         (lambda x: np.hstack([np.cos(x), np.interp(x, [0, 7], [0, 1])]), r"uses np\.interp"),
         (lambda x: np.hstack([x, x]) if x[0, 0] > 1 else np.hstack([x, -x]), "picks single rows"),
         (lambda x: np.hstack([x, x]) if (x > 1).any(axis=1) else x, "branches on values"),
@@ -404,6 +430,14 @@ def by_parts(x):
     return np.asarray(made)
 
 
+def under_other_names(x):
+    made = np.array(x)
+    as_it_is, of_its_type = np.asarray(made), made.astype(float, copy=False)
+    as_it_is[x > 1] = 7
+    of_its_type[:, 0] -= 1
+    return made if isinstance(x, np.ndarray) else x
+
+
 WHOLE = {
     **{name: lambda x, name=name: getattr(np, name)(x) for name in UNARY},
     **{name: lambda x, name=name: getattr(np, name)(x[:, :2], x[:, 1:]) for name in BINARY},
@@ -433,6 +467,8 @@ WHOLE = {
     "axes": lambda x: np.squeeze(np.swapaxes(np.expand_dims(x, 1), 1, 2), axis=2),
     "stacks": lambda x: np.hstack([np.vstack([x.T, x.T]).T, np.zeros((len(x), 2)), np.ones_like(x)]),
     "full": lambda x: np.full((len(x), 2), 0.5) + np.full_like(x[:, :2], 2) + np.zeros_like(x[:, 1:]),
+    "full of a row": lambda x: x * np.full((len(x), 3), [1.0, 2.0, 3.0]),
+    "under other names": under_other_names,
     "indices": lambda x: np.concatenate([x[:, [2, 0]], x[:, -1:], x[:, 1][:, None]], axis=1),
     "mask of columns": lambda x: x[:, np.array([True, False, True])],
     "take": lambda x: np.take(np.linspace(0, 1, 50), np.clip(x * 9 + 20, 0, 49).astype(int)),

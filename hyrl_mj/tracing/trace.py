@@ -43,6 +43,14 @@ def trace(
     try:
         with np.errstate(all="ignore"):
             results = _PrivateCopies().copy_of(function)(*map(Traced, inputs))
+        results = results if isinstance(results, tuple) else (results,)
+        if not all(isinstance(r, Traced) and r.shape[:1] == (BATCH,) for r in results):
+            raise BadInput(
+                f"{name} cannot be {purpose}: it must return one row for each row it gets"
+            )
+        return Program(inputs, tuple(result.operation for result in results))
+    except BadInput:
+        raise
     except Untraceable as error:
         raise BadInput(f"{name} cannot be {purpose}: it {error}") from error
     except Exception as error:  # code that gets another kind of array fails in many ways
@@ -50,10 +58,6 @@ def trace(
             f"{name} cannot be {purpose}: it raises {brief(error)} when its operations are traced; write "
             "it with NumPy's functions of arrays alone"
         ) from error
-    results = results if isinstance(results, tuple) else (results,)
-    if not all(isinstance(r, Traced) and r.shape[:1] == (BATCH,) for r in results):
-        raise BadInput(f"{name} cannot be {purpose}: it must return one row for each row it gets")
-    return Program(inputs, tuple(result.operation for result in results))
 
 
 # ---- replacements of functions that ignore NumPy's protocols for foreign arrays
@@ -64,8 +68,11 @@ def _filled(original: Callable[..., np.ndarray], *args: Any, **kwargs: Any) -> A
     array = original(*args, **kwargs)
     if BATCH not in array.shape:
         return array
-    number = 0 if original is np.empty else array.flat[0].item()
-    return apply("full", number, shape=array.shape, dtype=array.dtype.name)
+    filled = np.zeros_like(array) if original is np.empty else array
+    fill = filled.flat[0].item()
+    if not (filled == fill).all():  # each row of the batch is the first one
+        fill = filled[tuple(slice(1) if k == BATCH else slice(None) for k in filled.shape)]
+    return apply("full", fill, shape=array.shape, dtype=array.dtype.name)
 
 
 def _stacked(x: Any) -> Any:
@@ -79,7 +86,8 @@ def _converted(original: Callable[..., Any], x: Any, dtype: Any = None, **kwargs
     x = _stacked(x)
     if not isinstance(x, Traced):
         return original(x, dtype, **kwargs)
-    return x.astype(x.dtype if dtype is None else dtype)
+    copy = original is np.array and kwargs.get("copy", True)
+    return x.astype(x.dtype if dtype is None else dtype, copy=bool(copy))
 
 
 def _of_list(original: Callable[..., Any], x: Any, *args: Any, **kwargs: Any) -> Any:
@@ -177,6 +185,8 @@ class _PrivateCopies:
         names = original.__globals__
         if id(names) not in self._copies:
             own_builtins = {**vars(builtins), "__import__": self._import}
+            if not str(names.get("__name__")).startswith("hyrl_mj."):
+                own_builtins["isinstance"] = _is_instance
             self._keep(names, {**names, "__builtins__": own_builtins})
         namespace = self._copies[id(names)][1]
         cells = tuple(CellType() for _ in original.__closure__ or ())
@@ -225,6 +235,11 @@ class _PrivateCopies:
             parts = {k: self.copy_of(v) for k, v in value.items()} if type(value) is dict else value
             vars(stand_in)[name] = self.copy_of(parts)
         return stand_in
+
+
+def _is_instance(x: Any, kinds: Any) -> bool:
+    """Does isinstance() in users' code, to which a traced array is one of NumPy's."""
+    return isinstance(np.empty(0) if isinstance(x, Traced) else x, kinds)
 
 
 def _is_copied(module: str | None) -> bool:

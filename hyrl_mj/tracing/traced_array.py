@@ -77,13 +77,40 @@ def apply(name: str, *operands: Any, **options: Any) -> Traced:
 
 
 class Traced(NDArrayOperatorsMixin):
-    """An array that records the operations it results from."""
+    """An array that records the operations it results from.
+
+    In NumPy a part of an array, or the array in another shape, shares its memory. Here it does not: once one
+    of them was written to, the others cannot be used any more.
+    """
 
     def __init__(self, operation: Operation) -> None:
-        self.operation = operation
+        self._operation = operation
+        self._whole: tuple[Traced, Operation] | None = None  # of which it is a part, as it was then
+        self._written: Traced | None = None  # the part of it that was written to
         value = operation.value
         # Operations in place change none of these.
         self.shape, self.ndim, self.dtype = value.shape, value.ndim, value.dtype
+
+    @property
+    def operation(self) -> Operation:
+        """The last operation, whose result it is."""
+        part, changed = self, self._written is not None
+        while part._whole is not None:
+            whole, then = part._whole
+            other = whole._written is not None and whole._written is not part
+            changed |= other or whole._operation is not then
+            part = whole
+        if changed:
+            raise Untraceable(
+                "writes to an array of which a part has a name of its own: give that name to a copy"
+            )
+        return self._operation
+
+    def part_of(self, whole: Traced) -> Traced:
+        """Returns itself, as what shares its memory with another array."""
+        if self is not whole:
+            self._whole = whole, whole._operation
+        return self
 
     def __len__(self) -> int:
         return self.shape[0]
@@ -93,15 +120,17 @@ class Traced(NDArrayOperatorsMixin):
             raise Untraceable("loops over the rows of a batch: take all at once")
         return (self[i] for i in range(len(self)))
 
-    def astype(self, dtype: Any, **_: Any) -> Any:
-        name = np.dtype(dtype).name
-        return np.copy(self) if name == self.dtype.name else apply("astype", self, dtype=name)
+    def astype(self, dtype: Any, copy: bool = True, **_: Any) -> Any:
+        if (name := np.dtype(dtype).name) != self.dtype.name:
+            return apply("astype", self, dtype=name)
+        return np.copy(self) if copy else self
 
     def reshape(self, *shape: Any, **options: Any) -> Traced:
         return _call(np.reshape, self, shape[0] if len(shape) == 1 else shape, **options)
 
     def transpose(self, *axes: Any) -> Traced:
-        return apply("transpose", self, axes=np.empty(range(self.ndim)).transpose(*axes).shape)
+        order = np.empty(range(self.ndim)).transpose(*axes).shape
+        return apply("transpose", self, axes=order).part_of(self)
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):  # NumPy looks for its own protocols
@@ -163,9 +192,11 @@ class Traced(NDArrayOperatorsMixin):
                 picked = take(picked, indices if indices.ndim else int(indices), axis)
                 axis += indices.ndim - 1
             axis += 1
-        return picked
+        return picked if any(map(np.ndim, picking)) else picked.part_of(self)
 
     def __setitem__(self, index: Any, value: Any) -> None:
+        if value is self._written:  # as the second half of x[:, 0] -= 1
+            self._written = None
         rows, *columns = index if isinstance(index, tuple) else (index,)
         condition: Any = np.ones(self.shape[1:], dtype=bool)
         if not all(map(_is_whole, columns)):
@@ -192,7 +223,9 @@ class Traced(NDArrayOperatorsMixin):
         """Takes over the result of an operation in place."""
         if result.shape != self.shape:
             raise Untraceable("assigns an array of another shape")
-        self.operation = result.astype(self.dtype).operation
+        self._operation, part = result.astype(self.dtype).operation, self
+        while part._whole is not None:
+            part._whole[0]._written, part = part, part._whole[0]
         return self
 
 
@@ -227,7 +260,7 @@ def _reshape(x: Any, shape: Any) -> Traced:
     shape = np.reshape(x.operation.value, shape).shape
     if BATCH not in shape:
         raise Untraceable("joins the rows of a batch: each must stand for itself")
-    return x if shape == x.shape else apply("reshape", x, shape=shape)
+    return x if shape == x.shape else apply("reshape", x, shape=shape).part_of(x)
 
 
 def take(x: Any, indices: Any, axis: int | None = None) -> Traced:

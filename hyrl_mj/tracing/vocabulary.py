@@ -24,8 +24,8 @@ UFUNCS = {*ELEMENTWISE, "cos", "arctan2", "remainder"}
 REDUCTIONS = ("sum", "max", "min", "any", "all", "argmax", "argmin")
 
 
-class Untraceable(Exception):
-    """Code cannot be traced; the text completes "it ..."."""
+class Untraceable(BaseException):
+    """Code cannot be traced; the text completes "it ...". Code that catches its own errors lets it pass."""
 
 
 def _prod(x: Any, axis: Any = None, keepdims: bool = False) -> Any:

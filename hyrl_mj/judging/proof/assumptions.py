@@ -26,7 +26,7 @@ DEFAULTS = (
     "check_noise", "noise_in_chart",
 )  # fmt: skip
 # States at which the operations that were followed are compared with the method.
-COMPARED = 1_000
+COMPARED = 10_000
 
 
 def check_assumptions(task: Task) -> None:

@@ -121,7 +121,7 @@ class Cells(Places):
         n = int(counts.prod())
         outside = np.where(arrives, n, n + 1)
         outside[inside] = np.arange(n)
-        return Cells(
+        covering = Cells(
             arrived=ends[inside],
             failed=fails[inside],
             running=~(ends | fails)[inside],
@@ -136,6 +136,16 @@ class Cells(Places):
             outside=outside,
             margin=margin,
         )
+        # A node lies in all cells around it.
+        odd = lattice.failed & ~covering.all_around(covering.failed)
+        odd |= lattice.running & ~covering.all_around(~covering.arrived)
+        if odd.any():
+            raise Unbounded(
+                f"{method_of(task, 'ending')} gives another result at "
+                f"{task.chart.format(grid.nodes[odd][0])} than the operations that it does with the "
+                "measurement: let it do the same with all of them"
+            )
+        return covering
 
     def widened(self, by: np.ndarray) -> Cells:
         """Returns cells that end a run as they do where a robot is anywhere within `by` (d,) of them."""
