@@ -110,7 +110,7 @@ class Plain:
     [
         ("input", "changes the measurements that it is given"),
         ("answer", "changes an answer that it gave before"),
-        ("shape", r"of shape \(1280,\) for 1280 measurements"),
+        ("shape", r"of shape \(\d+,\) for \d+ measurements"),
         ("number", "not finite"),
         ("error", "raised LookupError"),
     ],
@@ -411,7 +411,7 @@ SPOILT = {
     "hidden": (Hidden, r"the agent answers .* and, asked again .* without chance or another"),
     "later": (HiddenLater, r"with a memory of .* and, asked again later, with a memory of"),
     "of the batch": (OfTheBatch, r"with a memory of .* and, in a batch of"),
-    "grows": (Growing, r"of shape \(256, 7\) of one float64 of shape \(256, 5\): keep the shape"),
+    "grows": (Growing, r"of shape \(16, 7\) of one float64 of shape \(16, 5\): keep the shape"),
     "of another type": (remembering(lambda n: np.zeros((n, 5), "f")), "memory float32 of shape"),
     "integers": (
         remembering(lambda n: np.zeros((n, 5), int)),
@@ -419,7 +419,7 @@ SPOILT = {
     ),
     "a list": (remembering(lambda n: [0.0] * n), "a memory of type list: give an array of floats"),
     "not finite": (remembering(lambda n: np.full((n, 5), np.nan)), "a memory of nan: give finite"),
-    "of other runs": (remembering(lambda n: np.zeros((n + 1, 5))), r"\(257, 5\) for 256 runs"),
+    "of other runs": (remembering(lambda n: np.zeros((n + 1, 5))), r"\(17, 5\) for 16 runs"),
     "starts as integers": (
         starting(lambda n: np.zeros((n, 5), int)),
         r"start\(\) of the agent giv",

@@ -286,6 +286,13 @@ def test_only_a_sparse_jacobian_with_constraints_is_refused(option, joint, wrong
     assert memory.wrong_physics(model, "3.17.0") == ""
 
 
+def test_bodies_that_may_sleep_are_refused():
+    xml = '<mujoco><option><flag sleep="{}"/></option><worldbody/></mujoco>'
+    for word, wrong in (("enable", True), ("disable", False)):
+        model = mjcf.mujoco.MjModel.from_xml_string(xml.format(word))
+        assert ("lets bodies sleep" in memory.unusable(model)) == wrong
+
+
 @pytest.mark.parametrize("name", hyrl_mj.task_names())
 def test_the_robots_of_this_package_have_a_dense_jacobian(name):
     model = hyrl_mj.get_task(name).model

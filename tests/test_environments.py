@@ -39,9 +39,11 @@ from planted import spare_environments, without_pdfs
 
 import hyrl_mj
 from hyrl_mj import BadInput, Outcome, from_gymnasium, get_task, simulate
-from hyrl_mj.gym_import import making
+from hyrl_mj.gym_import import inspection, making
 from hyrl_mj.gym_import.coordinates import coordinates
 from hyrl_mj.gym_import.instance import Instance, flat
+from hyrl_mj.gym_import.opening import Description
+from hyrl_mj.gym_import.specification import EnvironmentSpec
 from hyrl_mj.learning import presets
 from hyrl_mj.physics.mjcf import camera_of, point_of, rests
 from hyrl_mj.physics.rendering import SceneRenderer
@@ -312,6 +314,31 @@ def test_walls_that_nothing_collides_with_are_none_and_warnings_are_not_written(
 def test_wrong_arguments_are_refused_with_what_is_allowed(options, message):
     with pytest.raises(BadInput, match=message):
         from_gymnasium(Puck, **options)
+
+
+class Furnished(Puck):
+    """Around it are a door and a crate."""
+
+    xml = XML.replace(
+        "</worldbody>",
+        '<body pos="0 3 0.2"><joint type="slide" range="-1 1" limited="true"/><geom size="0.1"/></body>'
+        '<body pos="0 4 0.2"><freejoint/><geom size="0.1"/></body></worldbody>',
+    )
+
+
+@pytest.mark.parametrize(
+    ("pinned", "message"),
+    [
+        ({"qpos[2]": 1.2}, r"pinned qpos\[2\] of Furnished violates a range .* by 0.2 m or rad"),
+        ({"qpos[6]": 0.7}, r"pinned qpos\[6\] of Furnished is a part of a quaternion"),
+        ({"qpos[2]": np.nan}, "pinned .* give a number"),
+    ],
+)
+def test_pinned_positions_are_such_as_the_robot_can_have(pinned, message):
+    with pytest.raises(BadInput, match=message):
+        from_gymnasium(Furnished, steps=20, pinned=pinned)
+    pinned = {"qpos[2]": 0.9, "qpos[6]": 0.0, "qpos[7]": 1.0}
+    inspection._check_pinned(Instance(EnvironmentSpec(Description(Furnished, pinned=pinned))))
 
 
 ARM = """

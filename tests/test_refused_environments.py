@@ -101,6 +101,14 @@ class Held(Puck):
     xml = XML.replace("</mujoco>", sensor)
 
 
+class Sleepy(Puck):
+    xml = XML.replace("<worldbody>", '<option><flag sleep="enable"/></option><worldbody>')
+
+
+class Whole(Flat):
+    observation_space = spaces.Box(-9, 9, (6,), dtype=np.int64)
+
+
 class Longer(Flat):
     def _get_obs(self):
         return np.append(super()._get_obs(), 1.0)
@@ -129,6 +137,11 @@ KINDS = {
     "integers": (Levels, "Levels takes a Box of int64 as its actions, .* would be rounded"),
     "from -1": (Counted, r"counts its actions from -1, .*: let it take Discrete\(3\)"),
     "a sensor that holds": (Held, r"hold or delay what they measure \(px\)"),
+    "sleep": (Sleepy, "Sleepy cannot be used: puck lets bodies sleep, .*: leave <flag sleep"),
+    "floats in whole numbers": (
+        Whole,
+        r"observes [-\d.]+ in observation\[0\], .*int64,.* SB3 show agents -?\d:",
+    ),
     "more than its space": (Longer, "observes 7 number"),
     "a slow reset": (Slow, r"reset\(\) of Slow takes 3.* s"),
 }

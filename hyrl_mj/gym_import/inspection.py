@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+import mujoco
 import numpy as np
 from gymnasium import spaces
 
@@ -36,11 +37,11 @@ from hyrl_mj.gym_import.opening import (
     made,
 )
 from hyrl_mj.gym_import.pool import Pool
-from hyrl_mj.gym_import.resets import resets_of
+from hyrl_mj.gym_import.resets import SAME, resets_of, violation_of
 from hyrl_mj.gym_import.specification import Criterion
-from hyrl_mj.gym_import.starts import check_noted
+from hyrl_mj.gym_import.starts import VIOLATED, check_noted
 from hyrl_mj.gym_import.uses import check_copied, check_told, check_use, senses
-from hyrl_mj.physics import mjcf
+from hyrl_mj.physics import memory, mjcf
 from hyrl_mj.sets import Chart
 
 # Resets and steps of an inspection, about (without wrappers half as many resets), and from how long on it is
@@ -78,6 +79,7 @@ def inspect(description: Description, untried: bool = False) -> tuple[Pool, Inst
             "let it make a new one"
         )
     _check_times(instance)
+    _check_pinned(instance)
     instance.reset()
     _learn_spaces(instance)
     instance.learn(observer=trials.observer_of(instance))
@@ -144,9 +146,35 @@ def _check_times(instance: Instance) -> None:
     )
 
 
+def _check_pinned(instance: Instance) -> None:
+    """Raises `BadInput` if pinned positions violate a limit or a tie, or are no orientation."""
+    names = [name for name in instance.spec.description.pinned if name.startswith("qpos[")]
+    off = list[float]()
+    for plain in (True, False) if names else ():
+        instance.reset(plain=plain)
+        instance.physics.write(instance.physics.read())
+        off.append(violation_of(instance, joints=True))
+    told = f"pinned {', '.join(names[:4])} of {instance.name}"
+    if off and off[1] > off[0] + VIOLATED:
+        raise BadInput(
+            f"{told} violates a range of a joint or tendon, or an equality constraint, by {off[1]:.3g} m or "
+            "rad, so that runs begin with a push: pin what lies within"
+        )
+    unit = instance.data.qpos.copy()
+    mujoco.mj_normalizeQuat(instance.model, unit)
+    wrong = np.flatnonzero(np.abs(unit - instance.data.qpos) > SAME)
+    if any(f"qpos[{i}]" in names for i in wrong):
+        raise BadInput(
+            f"{told} is a part of a quaternion, whose squares do not sum to 1 with it: pin all of its four "
+            "numbers"
+        )
+
+
 def _learn_spaces(instance: Instance) -> None:
     """Finds what is observed and put in."""
     model, space = instance.model, instance.env.observation_space
+    if problem := memory.sleeping(model):
+        raise BadInput(f"{instance.name} cannot be used: {problem}")
     held = np.flatnonzero((model.sensor_delay != 0) | (model.sensor_interval != 0).any(axis=1))
     if len(held):
         named = ", ".join(model.sensor(i).name or f"sensor {i}" for i in held[:4])

@@ -22,7 +22,7 @@ from gymnasium import spaces
 from hyrl_mj.errors import BadInput, HyrlError, brief
 from hyrl_mj.gym_import import fingerprint as written
 from hyrl_mj.gym_import.expressions import entry
-from hyrl_mj.gym_import.observations import flat, observers, shaped
+from hyrl_mj.gym_import.observations import columns_of, flat, observers, parts_of, shaped
 from hyrl_mj.gym_import.opening import (
     actions_of,
     checked_step,
@@ -97,7 +97,13 @@ class Instance:
         self._left_out = ", ".join(name for name in names if name not in kept)
         self.is_wrapped = self.env is not self.inner
         self._space, self._actions = self.env.observation_space, actions_of(self.env)
-        self._columns = int(spaces.flatdim(self._space))
+        self._columns, parts = int(spaces.flatdim(self._space)), parts_of(self._space)
+        # Types in which what is observed may be another number, and their columns.
+        self._kinds = [
+            (parts[name].dtype, at)
+            for name, at in columns_of(self._space).items()
+            if parts[name].dtype not in (np.float32, np.float64)
+        ]
         self._observers = observers(self.env)
         self.observation, self.inner_seen = np.empty(0), None
         numbers = 4 + len(spec.criterion.keys) + len(spec.criterion.points)
@@ -462,6 +468,16 @@ class Instance:
                 f"{self.name} observes {len(vector)} number(s), and its observation_space has "
                 f"{self._columns}: let them be as many"
             )
+        for part, at in self._kinds:
+            seen = vector[at]
+            with np.errstate(invalid="ignore"):
+                given = seen.astype(part).astype(float)
+            if (given != seen).any():
+                i = int((given != seen).argmax())
+                raise BadInput(
+                    f"{self.name} observes {seen[i]:.6g} in observation[{at.start + i}], whose space is of "
+                    f"{part}, so that SB3 shows agents {given[i]:.6g}: give it a space of float32 or float64"
+                )
         return vector
 
     def watched(self) -> Any:

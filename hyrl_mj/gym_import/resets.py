@@ -95,11 +95,14 @@ def _is_as(numbers: np.ndarray | None, others: np.ndarray) -> bool:
     return numbers is not None and len(numbers) == len(others)
 
 
-def violation_of(instance: Instance) -> float:
-    """Returns by how much equality constraints and limits of tendons are violated at most [m, rad]."""
-    kinds, off = instance.data.efc_type, instance.data.efc_pos
-    equal = np.abs(off[kinds == mujoco.mjtConstraint.mjCNSTR_EQUALITY])
-    beyond = -off[kinds == mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON]
+def violation_of(instance: Instance, joints: bool = False) -> float:
+    """Returns by how much equality constraints and limits of tendons are violated at most [m, rad].
+
+    With `joints`, those of joints, too.
+    """
+    kinds, off, kind = instance.data.efc_type, instance.data.efc_pos, mujoco.mjtConstraint
+    limits = [kind.mjCNSTR_LIMIT_TENDON] + [kind.mjCNSTR_LIMIT_JOINT] * joints
+    equal, beyond = np.abs(off[kinds == kind.mjCNSTR_EQUALITY]), -off[np.isin(kinds, limits)]
     return float(np.append(equal, beyond).max(initial=0.0))
 
 

@@ -36,7 +36,17 @@ def remembers(model: mujoco.MjModel) -> str:
 
 def unusable(model: mujoco.MjModel) -> str:
     """Returns why a model cannot be simulated as it is meant, and the remedy; "" if it can."""
-    return wrong_physics(model) or keyed_mocap(model) or late_sensor(model)
+    return wrong_physics(model) or sleeping(model) or keyed_mocap(model) or late_sensor(model)
+
+
+def sleeping(model: mujoco.MjModel) -> str:
+    """Returns that bodies of a model may fall asleep, and the remedy; "" if they may not."""
+    if not model.opt.enableflags & getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0):
+        return ""
+    return (
+        f"{mjcf.model_name(model)} lets bodies sleep, and which are asleep is no part of MuJoCo's state, so "
+        'that runs go otherwise from where they are put: leave <flag sleep="enable"/> out'
+    )
 
 
 def wrong_physics(model: mujoco.MjModel, version: str = mujoco.__version__) -> str:

@@ -277,8 +277,8 @@ def read_agent(
         policy = from_callable(cast(PythonAgent, policy), task)
     check_act(policy)
     function: Policy = policy
-    agent = Agent(FUNCTION, "", _fingerprint(function, task))
     check_memoryless(function, task)
+    agent = Agent(FUNCTION, "", _fingerprint(function, task))
     return ExternalAgent(function, _seeing(agent, function))
 
 

@@ -8,8 +8,14 @@ is examined, than on a robot. `check_memoryless` tries one when it is accepted;
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+import os
+import signal
+import sys
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from multiprocessing import Pipe
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -31,6 +37,7 @@ if TYPE_CHECKING:
 # The trial of an agent: runs side by side, half of them by random inputs; and their samples. Of what takes a
 # call a batch, every fourth one does.
 RUNS, SAMPLES, SOME = 16, 64, 4
+LONGEST = 10.0  # for how long a forked process is waited for, which may hang [s]
 # Sums of 256 numbers in another order differ by some 16 roundings of float32; a network has a few of them.
 ROUNDING = 32 * float(np.finfo(np.float32).eps)
 
@@ -51,8 +58,9 @@ def check_memoryless(policy: Policy, task: Task, name: str = "the policy") -> No
     It acts in a few runs without noise, and watches as many that random inputs drive elsewhere. It is then
     asked about their measurements again: in the same batches, later first, and with only the first row in its
     place; in one batch, and in another order; in a few rows, and one by one, many times, in an array
-    that is used again; and once more in the first batches. This is about `as_function` of it, which neither
-    draws its inputs nor sees several observations.
+    that is used again; and once more in the first batches. Where processes can be forked, it is also asked
+    in one that is as before all of this, after others near them. This is about `as_function` of it, which
+    neither draws its inputs nor sees several observations.
 
     Raises:
         BadInput: it answers a measurement otherwise than before, or changes an array that is not its own.
@@ -96,6 +104,42 @@ def answers(
 Batch = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
+@contextmanager
+def _forked(work: Callable[[Any], str]) -> Iterator[Callable[[Any], str]]:
+    """Yields what gives work to this process as it is now: in a forked one, whatever comes in between.
+
+    What cannot be forked, or does not work there, as a GPU, answers "".
+    """
+    if not hasattr(os, "fork"):
+        yield lambda _: ""
+        return
+    ours, theirs = Pipe()
+    with warnings.catch_warnings():  # of threads, which stay here
+        warnings.simplefilter("ignore")
+        child = os.fork()
+    if not child:
+        try:
+            ours.close()
+            theirs.send(work(theirs.recv()))
+        finally:
+            os._exit(0)
+    theirs.close()
+
+    def told(given: Any) -> str:
+        with suppress(EOFError, OSError):
+            ours.send(given)
+            return str(ours.recv()) if ours.poll(LONGEST) else ""
+        return ""
+
+    try:
+        yield told
+    finally:
+        ours.close()
+        os.kill(child, signal.SIGKILL)
+        with suppress(ChildProcessError):
+            os.waitpid(child, 0)
+
+
 class _Trial:
     """The trial of one policy."""
 
@@ -106,7 +150,13 @@ class _Trial:
         self._span = _span(task)
 
     def run(self) -> None:
-        self._act()
+        with _forked(self._anew) as told:
+            self._act()
+            self._ask_again()
+            if problem := told(self.asked[::SOME]):
+                raise BadInput(problem)
+
+    def _ask_again(self) -> None:
         for batch in reversed(self.asked):
             self._compare(batch, "asked again later", again=True)
         measured, memory, first = map(np.concatenate, zip(*self.asked, strict=True))
@@ -126,6 +176,20 @@ class _Trial:
             self._compare((one, memory[i], first[i]), "alone")
         for batch in self.asked[::SOME]:
             self._compare(batch, f"asked again after {len(whole)} others", again=True)
+
+    def _anew(self, batches: Sequence[Batch]) -> str:
+        """Returns how answers differ where others near them are asked for first, "" if they do not."""
+        rng = np.random.default_rng(2)
+        if "torch" in sys.modules:  # its threads are in the process that this one was forked from
+            sys.modules["torch"].set_num_threads(1)
+        for measured, memory, first in batches:
+            off = 10.0 ** rng.uniform(-4, -1.5, (len(measured), 1)) * np.abs(measured).max(axis=0)
+            self._ask(measured + off * rng.uniform(-1, 1, measured.shape), memory)
+            try:
+                self._compare((measured, memory, first), "after others near it")
+            except BadInput as error:
+                return str(error)
+        return ""
 
     def _act(self) -> None:
         """Acts in runs from the start distribution; what has ended begins anew once all have."""
