@@ -14,6 +14,7 @@ import struct
 import subprocess
 import sys
 import time
+import zipfile
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from pathlib import Path
@@ -31,7 +32,7 @@ import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, HyrlError, from_gymnasium
 from hyrl_mj.cli import parsing
 from hyrl_mj.fields import read_field
-from hyrl_mj.files import artifacts, trust
+from hyrl_mj.files import archives, artifacts, trust
 from hyrl_mj.files.manifest import Manifest, locked
 from hyrl_mj.files.sources import digest_of
 from hyrl_mj.gym_import import making
@@ -511,6 +512,17 @@ def test_statistics_are_numbers_of_a_size_that_can_be_reckoned_with(arrays, mess
     np.savez(tmp_path / "s.npz", **usual | arrays)
     with pytest.raises(BadArtifact, match=message):
         Normalization.load(tmp_path / "s.npz")
+
+
+@pytest.mark.parametrize(
+    ("shape", "kind"), [((2**34, 0), "<f8"), ((0, 2**34), "<f8"), ((2**34,), "<U0")]
+)
+def test_rows_and_numbers_without_a_byte_count(shape, kind, tmp_path):
+    header = {"shape": shape, "fortran_order": False, "descr": kind}
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as file, file.open("a.npy", "w") as member:
+        np.lib.format.write_array_header_1_0(member, header)
+    with pytest.raises(BadArtifact, match="unpacks to more than 1 MiB"):
+        archives.read_npz(tmp_path / "a.npz", 2**20)
 
 
 @pytest.mark.parametrize("kind", [complex, "m8[s]", "S1", [("a", float)]])
