@@ -2,15 +2,19 @@
 
 import contextlib
 import csv
+import importlib.util
 import io
 import json
+import marshal
 import multiprocessing
 import os
 import resource
 import shutil
+import struct
 import subprocess
 import sys
 import time
+import zipfile
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from pathlib import Path
@@ -28,7 +32,7 @@ import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, HyrlError, from_gymnasium
 from hyrl_mj.cli import parsing
 from hyrl_mj.fields import read_field
-from hyrl_mj.files import artifacts, trust
+from hyrl_mj.files import archives, artifacts, trust
 from hyrl_mj.files.manifest import Manifest, locked
 from hyrl_mj.files.sources import digest_of
 from hyrl_mj.gym_import import making
@@ -128,18 +132,59 @@ def test_a_path_without_a_name_is_one_sentence():
 # ---- code
 
 
-def test_code_is_known_with_all_that_is_imported_with_it(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("named", "changed"),
+    [
+        ("robot", "helper.py"),
+        ("robot", "entry.py"),
+        ("robot", "late.py"),
+        ("package:Env-v0", "package/part.py"),
+        ("package:Env-v0", "beside.py"),
+        ("package:Env-v0", "entry.py"),
+    ],
+)
+def test_code_is_known_with_all_that_is_imported_with_it(named, changed, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "robot.py").write_text("import helper\n")
+    text = "import helper; gym.register('R-v0', 'entry.sub:Env'); importlib.import_module('late')\n"
     (tmp_path / "package").mkdir()
-    for name in ("helper.py", "package/__init__.py", "package/part.py"):
+    (tmp_path / "robot.py").write_text(text)
+    (tmp_path / "package" / "part.py").write_text("import beside; name = 'entry:Env'\n")
+    for name in (
+        "helper.py",
+        "entry.py",
+        "late.py",
+        "beside.py",
+        "other.py",
+        "package/__init__.py",
+    ):
         (tmp_path / name).write_text("")
-    for named, changed in (("robot", "helper.py"), ("package:Env-v0", "package/part.py")):
-        path = trust.module_file(named)
-        trust.remember(path)
-        assert trust.is_known(path)
-        (tmp_path / changed).write_text("# another one\n")
-        assert not trust.is_known(path)
+    path = trust.module_file(named)
+    trust.remember(path)
+    (tmp_path / "other.py").write_text("# another one\n")
+    assert trust.is_known(path)
+    (tmp_path / changed).write_text("# another one\n")
+    assert not trust.is_known(path)
+
+
+def test_compiled_code_beside_a_file_is_not_executed(tmp_path, monkeypatch):
+    """`__pycache__` comes with a folder, and says itself of which file it is."""
+    monkeypatch.chdir(tmp_path)
+    robot = write_task("robot_3", tmp_path)[0]
+    robot.write_text("import help3.part\n" + robot.read_text())
+    (tmp_path / "help3").mkdir()
+    (tmp_path / "module3.py").write_text("import help4\nclass X: pass\n")
+    for name in ("help3/__init__.py", "help3/part.py", "help4.py"):
+        (tmp_path / name).write_text("")
+    for path in tmp_path.rglob("*.py"):
+        status, compiled = path.stat(), Path(importlib.util.cache_from_source(str(path)))
+        compiled.parent.mkdir(exist_ok=True)
+        head = struct.pack("<LLL", 0, int(status.st_mtime), status.st_size)
+        code = compile(f"open({path.stem!r}, 'w').close()\n{path.read_text()}", path, "exec")
+        compiled.write_bytes(importlib.util.MAGIC_NUMBER + head + marshal.dumps(code))
+    before = {*os.listdir(tmp_path)}
+    assert hyrl_mj.get_task(robot).name == "robot_3"
+    assert algorithms.imported("module3:X", "it").__name__ == "X"
+    assert {*os.listdir(tmp_path)} == before
 
 
 def test_code_that_a_file_names_is_not_even_read(tmp_path, monkeypatch):
@@ -467,6 +512,17 @@ def test_statistics_are_numbers_of_a_size_that_can_be_reckoned_with(arrays, mess
     np.savez(tmp_path / "s.npz", **usual | arrays)
     with pytest.raises(BadArtifact, match=message):
         Normalization.load(tmp_path / "s.npz")
+
+
+@pytest.mark.parametrize(
+    ("shape", "kind"), [((2**34, 0), "<f8"), ((0, 2**34), "<f8"), ((2**34,), "<U0")]
+)
+def test_rows_and_numbers_without_a_byte_count(shape, kind, tmp_path):
+    header = {"shape": shape, "fortran_order": False, "descr": kind}
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as file, file.open("a.npy", "w") as member:
+        np.lib.format.write_array_header_1_0(member, header)
+    with pytest.raises(BadArtifact, match="unpacks to more than 1 MiB"):
+        archives.read_npz(tmp_path / "a.npz", 2**20)
 
 
 @pytest.mark.parametrize("kind", [complex, "m8[s]", "S1", [("a", float)]])

@@ -120,6 +120,16 @@ def test_functions_that_call_each_other_without_end_are_refused(circle, tmp_path
     refused(path, circle, "cannot be read")
 
 
+def test_a_model_is_read_as_it_was_examined(circle, tmp_path):
+    """onnxruntime takes a file with these letters for one of its own, with any operators."""
+    path = saved(tmp_path, [node("Tanh", "g")])
+    unknown_field = b"\x7a\x06xxORTM"
+    path.write_bytes(unknown_field + path.read_bytes())
+    assert np.isfinite(
+        load_agent(path, circle).act(np.zeros((1, circle.measurement_columns)))
+    ).all()
+
+
 def test_a_model_without_outputs_is_refused(circle, tmp_path):
     refused(saved(tmp_path, [], outputs=()), circle, "it gives no output")
 

@@ -61,7 +61,9 @@ def read_npz(source: bytes | Path, limit: int) -> dict[str, np.ndarray]:
                 if np.lib.format.read_magic(member) != (1, 0):
                     raise BadArtifact(f"its {name} is no array of the usual format")
                 shape, _, dtype = np.lib.format.read_array_header_1_0(member)
-            if (size := math.prod(shape) * dtype.itemsize) > limit:
+            # Also rows and numbers without a byte take their share where they are reckoned with.
+            sides = [max(side, 1) for side in (*shape, dtype.itemsize)]
+            if (size := math.prod(sides)) > limit:
                 raise BadArtifact(f"its {name} unpacks to more than {limit / 2**20:g} MiB")
             limit -= size
             with _member(file, name) as member:

@@ -25,7 +25,7 @@ from filelock import FileLock, Timeout
 from hyrl_mj.errors import BadInput
 from hyrl_mj.files import artifacts
 from hyrl_mj.files.artifacts import digest, replacing
-from hyrl_mj.files.sources import digest_of, modules_in
+from hyrl_mj.files.sources import compile_each_time, digest_of
 
 # The records hold hashes of files by path, and of texts and written files by these keys: of each as many.
 TEXTS, WRITTEN, MOST = "texts", "written", 1_000
@@ -59,6 +59,8 @@ def current_folder(name: str) -> Iterator[None]:
     if _installed(name) is not None:
         yield
         return
+    if (file := module_file(name)) is not None:
+        compile_each_time(file)
     sys.path.append("")
     try:
         yield
@@ -120,10 +122,7 @@ def is_known(path: Path) -> bool:
 
 def _digest(path: Path) -> str:
     """Returns the SHA-256 of a file; of code with all that is imported with it from its folder or package."""
-    if path.suffix != ".py":
-        return digest(path)
-    parts = modules_in(path.parent) if path.name == "__init__.py" else []
-    return sha256("".join([digest_of(path), *map(digest, parts)]).encode()).hexdigest()
+    return digest_of(path) if path.suffix == ".py" else digest(path)
 
 
 def remember_text(text: str) -> None:

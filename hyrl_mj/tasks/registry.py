@@ -16,7 +16,13 @@ import numpy as np
 
 from hyrl_mj.errors import BadInput, brief, line_in, unknown
 from hyrl_mj.files import trust
-from hyrl_mj.files.sources import check_helpers, digest_of, forget_helpers
+from hyrl_mj.files.sources import (
+    FromSource,
+    check_helpers,
+    compile_each_time,
+    digest_of,
+    forget_helpers,
+)
 from hyrl_mj.tasks.base import Task
 
 _REGISTRY: dict[str, type[Task]] = {}
@@ -308,7 +314,9 @@ def _run(path: Path) -> ModuleType:
 
 def _executed(path: Path, name: str) -> ModuleType:
     """Returns a file as a module of that name."""
-    spec = importlib.util.spec_from_file_location(name, path)
+    compile_each_time(path)
+    loader = FromSource(name, str(path))
+    spec = importlib.util.spec_from_file_location(name, path, loader=loader)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
