@@ -358,6 +358,7 @@ def _check_step(
     task.observation(measurement)  # the last one of an episode is learned from, too
     reward = task.reward(measurement, u)
     check_finite(task, "reward", reward, measurement)
+    check_finite(task, "danger", task.danger(measurement), measurement, infinite=True)
     low = running & (reward < task.worst_reward)
     if low.any():
         point = task.chart.format(task.z(measurement)[np.argmax(low)])
@@ -390,7 +391,8 @@ def _check_end(task: Task, path: np.ndarray, measurement: np.ndarray) -> None:
             )
     task.arrived(path[-1])
     task.verdict(measurement)
-    for name, values in (("miss", task.miss(path[-1])), ("danger", task.danger(measurement))):
-        if np.isnan(values).any():
-            point = task.chart.format(path[-1][int(np.argmax(np.isnan(values)))])
-            raise BadInput(f"{name}() gives nan at {point}: give numbers")
+    miss = task.miss(path[-1])
+    check_finite(task, "miss", miss, path[-1], infinite=True)
+    if (miss < 0).any():
+        point = task.chart.format(path[-1][np.argmin(miss)])
+        raise BadInput(f"miss() gives {miss.min():g} at {point}: give a distance, >= 0")
