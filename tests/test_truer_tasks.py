@@ -257,6 +257,22 @@ def test_an_inner_loop_gets_its_inputs_at_each_step(tmp_path):
         simulate(get_task(path), Steer(), [0.0, 0.5])
 
 
+def test_an_input_may_act_only_where_another_one_does(tmp_path):
+    own = (
+        "    def control(self, u, qpos, qvel):\n        speed, turn = u.T\n"
+        "        return np.column_stack([speed, speed * turn])\n"
+    )
+    numerics = "".join(f'<numeric name="{name}" data="-1 1"/>' for name in ("speed", "turn"))
+    path = write(
+        tmp_path,
+        {"methods": own},
+        DRIVEN,
+        lambda xml: xml.replace("</custom>", numerics + "</custom>"),
+    )
+    path.write_text(path.read_text().replace('inputs = ("u",)', 'inputs = ("speed", "turn")'))
+    trial.try_inputs(get_task(path))  # a car that stands does not turn
+
+
 def test_runs_of_a_user_s_robot_are_played_again_where_they_are_simulated(tmp_path):
     own = (
         "    def state(self, z, rng=None):\n"
