@@ -13,7 +13,7 @@ from hyrl_mj import BadInput, Outcome
 from hyrl_mj.gym_export import BatchedEnv
 from hyrl_mj.physics import memory, mjcf, mujoco_log
 from hyrl_mj.policies import PolicyController
-from hyrl_mj.simulation import LoopSettings, closed_loop
+from hyrl_mj.simulation import LoopSettings, Noise, closed_loop
 from hyrl_mj.tasks import SPARING, check_task, trial
 from hyrl_mj.tasks.scaffold import write_task
 
@@ -37,6 +37,10 @@ def changed(folder, *edits):
 OBSERVED = r"return measured\[:, :3\]\n\n    def measured"
 REWARDED, REWARD = r"        close = np\.maximum", "        close = np.maximum"
 ENDED, THEN = r"        return ends\n", "\n\n    def measured"
+BAND = (
+    r"return -self\.clearance\(measured\)",
+    "c = self.clearance(measured)\n        return np.where(np.abs(c - 0.5) < 0.1, np.nan, -c)",
+)
 CROSSED = r"ends\[measured\[:, 0\] >= self\.set_point\[0\]\] = Outcome\.REACHED"
 MISTAKES = {
     "no start to replay": ((PY, r"starts=\(.*\)\),? time", "starts=(), time"), "scene.starts is empty"),
@@ -80,9 +84,11 @@ MISTAKES = {
     "an exit": ((PY, REWARDED, "        raise SystemExit(0)\n" + REWARD), "SystemExit: 0"),
     "a state that is nan": ((PY, "return z, np.stack", "return z * np.nan, np.stack"), "qpos that is not"),
     "a state that is no pair": ((PY, "return z, np.stack", "return np.stack"), "give a tuple"),
-    "a miss that is nan": ((PY, r"np\.abs\(z\[:, 1\]\)", "np.nan * z[:, 1]"), r"miss\(\) gives nan at x"),
+    "a miss that is nan": ((PY, r"np\.abs\(z\[:, 1\]\)", "np.nan * z[:, 1]"), r"miss\(\) .*gives nan at x"),
     "misses that are complex": ((PY, r"np\.abs\(z\[:, 1\]\)", "z[:, 1] + 1j"), "array of real numbers"),
     "misses in columns": ((PY, r"np\.abs\(z\[:, 1\]\)", "np.abs(z)"), r"miss\(\) .*shape \(\d+, 2\)"),
+    "a miss with a sign": ((PY, r"np\.abs\(z\[:, 1\]\)", "z[:, 1]"), r"miss\(\) gives -.*a distance"),
+    "a danger that is nan": ((PY, *BAND), r"danger\(\) .*gives nan at x"),
     "one danger for all": ((PY, r"return -self\.clearance\(measured\)", "return 1.0"), r"danger\(\).*float"),
     "a sample of too many steps": ((XML, 'data="0.05"', 'data="100"'), "10,000 physics steps.*5,000"),
     "a sample that is not a time": ((XML, 'data="0.05"', 'data="nan"'), "XML contains a 'NaN'"),
@@ -179,10 +185,10 @@ def test_a_trial_of_a_slow_plant_has_fewer_episodes(vehicle, monkeypatch):
 
 
 class Late:
-    """Steers ahead."""
+    """Steers nearly ahead, and otherwise where noise shows it."""
 
     def act(self, measured):
-        return np.zeros((len(measured), 1))
+        return 1e-3 * measured[:, 1:2]
 
 
 LATE_END = "        assert (measured[:, 0] < 1).all()\n        return ends\n"
@@ -197,12 +203,14 @@ LATE_Z = (
     [
         (ENDED, LATE_END, r"ending\(\) .*AssertionError.* at x = 1"),
         (OBSERVES, LATE_Z, r"z\(\) of the task .* gives \[nan"),
+        (*BAND, r"danger\(\) of the task .* gives nan at x"),
     ],
 )
 def test_a_failure_in_a_simulation_names_method_and_state(tmp_path, old, new, says):
     task, settings = changed(tmp_path, (PY, old, new)), LoopSettings(quiet=True)
+    noise, z0 = Noise("adversarial", 0.01), np.array([[0.0, 0.9]])
     with pytest.raises(BadInput, match=says):
-        closed_loop(task, PolicyController(Late()), np.array([[0.0, 0.9]]), settings=settings)
+        closed_loop(task, PolicyController(Late()), z0, noise, settings=settings)
 
 
 @pytest.mark.parametrize(

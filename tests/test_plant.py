@@ -3,6 +3,7 @@
 import copy
 import os
 import pickle
+import re
 import signal
 
 import mujoco
@@ -243,6 +244,24 @@ def test_a_simulation_that_breaks_down_is_told_and_leaves_the_others_alone(rocke
     rocket.step(np.zeros((3, 1)))
     assert not rocket.unstable.any()
     np.testing.assert_array_equal(rocket.measurement, [[0.1], [0.5], [0.3]])
+
+
+def test_a_state_that_mujoco_resets_for_its_acceleration_is_unstable(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    servo = '<velocity name="thrust" joint="x" kv="1e9" ctrlrange="-20 20"/>'
+    xml = re.sub("<motor .*/>", servo, ROCKET).replace(
+        "<option", '<option integrator="implicitfast"'
+    )
+    (tmp_path / "strong.xml").write_text(xml)
+    plant = Plant(mjcf.load(tmp_path / "strong.xml"), ("thrust",), 2)
+    plant.set_state(np.array([[0.1], [0.2]]))
+    plant.step(np.array([[5.0], [15.0]]))
+    np.testing.assert_array_equal(plant.unstable, [False, True])
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "strong.xml"))
+    data = mujoco.MjData(model)
+    data.qpos, data.ctrl = 0.2, 15.0
+    mujoco.mj_step(model, data)
+    assert data.qpos == plant.qpos[1] == 0
 
 
 def test_a_plant_with_inertia_cannot_run_backward(rocket):

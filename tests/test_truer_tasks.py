@@ -257,6 +257,22 @@ def test_an_inner_loop_gets_its_inputs_at_each_step(tmp_path):
         simulate(get_task(path), Steer(), [0.0, 0.5])
 
 
+def test_an_input_may_act_only_where_another_one_does(tmp_path):
+    own = (
+        "    def control(self, u, qpos, qvel):\n        speed, turn = u.T\n"
+        "        return np.column_stack([speed, speed * turn])\n"
+    )
+    numerics = "".join(f'<numeric name="{name}" data="-1 1"/>' for name in ("speed", "turn"))
+    path = write(
+        tmp_path,
+        {"methods": own},
+        DRIVEN,
+        lambda xml: xml.replace("</custom>", numerics + "</custom>"),
+    )
+    path.write_text(path.read_text().replace('inputs = ("u",)', 'inputs = ("speed", "turn")'))
+    trial.try_inputs(get_task(path))  # a car that stands does not turn
+
+
 def test_runs_of_a_user_s_robot_are_played_again_where_they_are_simulated(tmp_path):
     own = (
         "    def state(self, z, rng=None):\n"
@@ -619,17 +635,33 @@ def test_an_obstacle_on_a_body_that_stands_still_is_where_it_is_in_the_world(tmp
     np.testing.assert_array_equal(mjcf.site_pos(model, "tracked"), np.zeros(3))  # on the robot
 
 
+# What is measured beside x and y is a height, which is 0 wherever a robot is put on its chart.
+LIFTED = {
+    "noisy": "(False, True, False)",
+    "ending": "x, y, h = measured.T\n        ends = np.where((x >= 3) & (h > 1), Outcome.REACHED, 0)",
+}
+HEIGHT = (
+    "    def measure(self, sensors):\n        return np.hstack([sensors, 0 * sensors[:, :1]])\n"
+)
+
+
 @pytest.mark.parametrize(
-    ("ending", "outcome"),
-    [(PY["ending"], "stalled"), ("ends = np.zeros(len(measured), int)", "reached")],
+    ("own", "height", "outcome"),
+    [
+        ({}, "", "stalled"),
+        ({"ending": "ends = np.zeros(len(measured), int)"}, "", "reached"),
+        (LIFTED, HEIGHT, "stalled"),
+    ],
 )
 def test_who_is_still_under_way_has_not_arrived_where_the_end_says_who_has(
-    ending, outcome, tmp_path
+    own, height, outcome, tmp_path
 ):
-    own = {"max_steps": "10", "methods": "    def miss(self, z):\n        return np.abs(z[:, 1])\n"}
-    task = get_task(write(tmp_path, own | {"ending": ending}))
+    miss = "    def miss(self, z):\n        return np.abs(z[:, 1])\n"
+    task = get_task(write(tmp_path, own | {"max_steps": "10", "methods": miss + height}))
     assert task.ends_well == (outcome == "stalled")
-    assert Outcome(task.verdict(np.array([[0.6, 0.1]]))[0]).label == outcome
+    assert (
+        Outcome(task.verdict(task.placed(np.array([[0.6, 0.1]])).measurement)[0]).label == outcome
+    )
 
 
 @pytest.mark.parametrize(

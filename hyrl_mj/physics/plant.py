@@ -106,6 +106,7 @@ class Plant:
         self._ctrl = self._batch.bind("ctrl")
         self._mocap_pos, self._mocap_quat = map(self._batch.bind, ("mocap_pos", "mocap_quat"))
         self._geom_positions: np.ndarray | None = None
+        self._warned = np.zeros(self.n, dtype=int)  # how often of bad accelerations
         if self._columns_of_state is None:
             self._sensors = self._batch.bind("sensordata")
         if state is not None:
@@ -309,14 +310,17 @@ class Plant:
         sense_now = sense and self._mocap is None
         self._batch.step(ids, substeps, self._stage if sense_now else mujoco.mjtStage.mjSTAGE_NONE)
         mujoco_log.say()
-        # MuJoCo's own criterion of a bad state: NaN, infinite, or beyond mjMAXVAL.
+        # MuJoCo's own criteria of a bad state, which it would reset: a position or a velocity that is NaN,
+        # infinite, or beyond mjMAXVAL, or such an acceleration, of which only the warning tells.
+        warned = self._batch.warning[:, int(mujoco.mjtWarning.mjWARN_BADQACC), 1]
+        bad = warned != self._warned
         for values in (self._qpos, self._qvel):
-            valid = np.abs(values) <= mujoco.mjMAXVAL
-            if not valid.all():
-                bad = np.flatnonzero(~valid.all(axis=1))
-                self._unstable[bad] = True
-                self._batch.state[bad] = self._initial
-                self._sense(bad)
+            bad |= ~(np.abs(values) <= mujoco.mjMAXVAL).all(axis=1)
+        if bad.any():
+            self._warned, rows = warned.copy(), np.flatnonzero(bad)
+            self._unstable[rows] = True
+            self._batch.state[rows] = self._initial
+            self._sense(rows)
         if self._mocap is not None:
             self._drive(self._rows(ids))
             if sense:

@@ -164,7 +164,7 @@ def column_noise(
     if unsure:
         remarks.append(f"the drift of {name} is too small in its noise for its rate to be sure")
     if (over := np.abs(left[used]).max()) > 2 * (bound + quantum / 2 + drift / 20) + tiny:
-        remarks.append(f"some samples of {name} are beyond the bound, the farthest by {over:.3g}")
+        remarks.append(f"some samples of {name} are beyond the bound, up to {over:.3g}")
     bias = nan if r is None else float(sum(np.quantile(slow, ENDS)) / 2)
     unsure_bias = max(3 * sigma / np.sqrt(used.sum()), drift / 20, quantum / 20)
     return ColumnNoise(

@@ -13,7 +13,7 @@ from hyrl_mj.physics.plant import Plant
 from hyrl_mj.policies import Controller, answer, is_memory, memory_at_start
 from hyrl_mj.simulation.noise import NOT_STARTED, Sample, Signal, register_noise
 from hyrl_mj.simulation.passing import Rows
-from hyrl_mj.tasks import Outcome, Task
+from hyrl_mj.tasks import Outcome, Task, check_finite
 
 # Samples by which a plant with inertia is simulated ahead.
 AHEAD = 6
@@ -244,6 +244,7 @@ class Lookahead(Signal):
             goes_on = outcome == Outcome.RUNNING
             failed = ~goes_on & (outcome != Outcome.REACHED)
             danger[rows, sample] = np.where(failed, np.inf, self.task.danger(after))
+            check_finite(self.task, "danger", danger[rows, sample], after, infinite=True)
             rows = rows[goes_on]
             if not len(rows):
                 break

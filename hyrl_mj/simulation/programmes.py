@@ -10,7 +10,7 @@ from hyrl_mj.policies import Controller
 from hyrl_mj.simulation.lookahead import answer_of, each_answer, memory_of
 from hyrl_mj.simulation.noise import NOT_STARTED, Sample, Signal
 from hyrl_mj.simulation.rules import RuleKind, Rules
-from hyrl_mj.tasks import Outcome, Task
+from hyrl_mj.tasks import Outcome, Task, check_finite
 
 # The number of a signal that is given, in a programme: no rule.
 GIVEN = -1
@@ -136,7 +136,9 @@ class Programmes(Signal):
         self, true: np.ndarray, rows: np.ndarray, u: np.ndarray, jumped: np.ndarray
     ) -> None:
         """Notes what the runs `rows` (r,) meet in states of measurements (r, p), and their answers (r, m)."""
-        self.danger[rows] = np.maximum(self.danger[rows], self.task.danger(true))
+        danger = self.task.danger(true)
+        check_finite(self.task, "danger", danger, true, infinite=True)
+        self.danger[rows] = np.maximum(self.danger[rows], danger)
         self.rewards[rows] += self.task.reward(true, u)
         change = np.linalg.norm(self._scaled(u) - self._scaled(self._last[rows]), axis=1) / 2
         begun = ~np.isnan(change)

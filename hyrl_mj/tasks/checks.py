@@ -194,7 +194,7 @@ def _check_parts(task: Task) -> None:
             "as many numbers each as observation() has columns, the lower ones first"
         )
     _check_scene(task)
-    shares = [float(share) if isinstance(share, bool) else share for share in task.noisy]
+    shares = [float(share) if isinstance(share, bool | np.bool_) else share for share in task.noisy]
     if not any(Several(Number(0, 1e6), d, 1_000).checked("noisy", shares)):
         raise BadInput(
             f"noisy is {task.noisy}: give a share > 0 of the noise bound for one column or more"

@@ -61,14 +61,21 @@ def writes(error: BaseException) -> bool:
     return isinstance(error, ValueError) and "read-only" in str(error)
 
 
-def check_finite(task: Task, name: str, values: np.ndarray, measurement: np.ndarray) -> None:
-    """Raises `BadInput` if the values (n,) that method `name` gave for measurements (n, p) are not finite."""
-    if not math.isfinite(values.sum()) and not (finite := np.isfinite(values)).all():
-        row = int(np.argmin(finite))
-        raise BadInput(
-            f"{name}() of the task {task.name} gives {values[row]}{_place(task, name, [measurement], row)}: "
-            "give finite numbers"
-        )
+def check_finite(
+    task: Task, name: str, values: np.ndarray, measurement: np.ndarray, infinite: bool = False
+) -> None:
+    """Raises `BadInput` if method `name` gave values (n,) for measurements (n, p) that are not finite.
+
+    They may be `infinite`, and are no NaN then.
+    """
+    if not math.isfinite(values.sum()):
+        good = ~np.isnan(values) if infinite else np.isfinite(values)
+        if not good.all():
+            row = int(np.argmin(good))
+            raise BadInput(
+                f"{name}() of the task {task.name} gives {values[row]}"
+                f"{_place(task, name, [measurement], row)}: give {'' if infinite else 'finite '}numbers"
+            )
 
 
 def _guarded(name: str, method: Callable[..., Any]) -> Callable[..., Any]:

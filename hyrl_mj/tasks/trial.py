@@ -192,14 +192,16 @@ def _methods(task: Task, z: np.ndarray, measured: np.ndarray) -> dict[str, OfRow
 
 
 def try_inputs(task: Task) -> None:
-    """Raises `BadInput` if one of the inputs changes nothing that is measured."""
-    low, high = task.input_limits
+    """Raises `BadInput` if one of the inputs changes nothing that is measured, whatever the others are.
+
+    A car that stands does not turn, and does not brake.
+    """
     rng = np.random.default_rng(0)
-    z = task.starts(STARTS, rng)
+    z, drawn = task.starts(STARTS, rng), task.draw_inputs(STARTS, rng)
     for i, name in enumerate(task.inputs):
         seen = []
-        for limit in (low, high):
-            plant, u = task.placed(z), np.tile((low + high) / 2, (STARTS, 1))
+        for limit in task.input_limits:
+            plant, u = task.placed(z), drawn.copy()
             u[:, i] = limit[i]
             with mujoco_log.kept():  # the episodes tell more
                 for _ in range(min(EFFECT, _samples(task))):
@@ -217,10 +219,10 @@ def try_control(task: Task) -> None:
     if not (task.has_inner_loop and task.steady_control):
         return
     rng = np.random.default_rng(0)
-    z = task.chart.draw(STARTS, rng)
-    u = task.draw_inputs(STARTS, rng)
+    z = task.chart.draw(ANYWHERE, rng)
+    u = task.draw_inputs(ANYWHERE, rng)
     qpos, qvel = task.state(z, rng)
-    qvel = rng.normal(size=(STARTS, task.model.nv)) if qvel is None else qvel
+    qvel = rng.normal(size=(ANYWHERE, task.model.nv)) if qvel is None else qvel
     if not np.array_equal(task.control(u, qpos, qvel), task.control(u, qpos[::-1], qvel[::-1])):
         raise BadInput(
             "steady_control is True, but control() gives other controls for the same inputs at another "
@@ -358,6 +360,7 @@ def _check_step(
     task.observation(measurement)  # the last one of an episode is learned from, too
     reward = task.reward(measurement, u)
     check_finite(task, "reward", reward, measurement)
+    check_finite(task, "danger", task.danger(measurement), measurement, infinite=True)
     low = running & (reward < task.worst_reward)
     if low.any():
         point = task.chart.format(task.z(measurement)[np.argmax(low)])
@@ -390,7 +393,8 @@ def _check_end(task: Task, path: np.ndarray, measurement: np.ndarray) -> None:
             )
     task.arrived(path[-1])
     task.verdict(measurement)
-    for name, values in (("miss", task.miss(path[-1])), ("danger", task.danger(measurement))):
-        if np.isnan(values).any():
-            point = task.chart.format(path[-1][int(np.argmax(np.isnan(values)))])
-            raise BadInput(f"{name}() gives nan at {point}: give numbers")
+    miss = task.miss(path[-1])
+    check_finite(task, "miss", miss, path[-1], infinite=True)
+    if (miss < 0).any():
+        point = task.chart.format(path[-1][np.argmin(miss)])
+        raise BadInput(f"miss() gives {miss.min():g} at {point}: give a distance, >= 0")
