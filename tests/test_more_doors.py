@@ -22,7 +22,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from attacks import MARKER, child, crafted_agents
+from attacks import MARKER, child, crafted_agents, forgery
 from attacks.folders import plant_modules
 from command_line import call
 from environments import Puck
@@ -539,6 +539,31 @@ def test_modes_are_integers(modes, planted_circle, tmp_path):
         np.savez(tmp_path / "e.npz", **{**arrays, "modes": modes})
     with pytest.raises(BadArtifact, match="its modes cannot be used: its numbers are no integers"):
         ExtendedSets.load(tmp_path / "e.npz", hyrl_mj.get_task("unit_circle"))
+
+
+@pytest.mark.parametrize(
+    ("name", "arrays"),
+    [
+        ("critical_set", {"points": np.ones((1, 1), bool)}),
+        ("critical_set", {"points": np.full((1, 1), 1e308)}),
+        ("critical_set", {"component": np.array(["x"])}),
+        ("critical_set", {"component": np.full(1, 2**64 - 1, np.uint64)}),
+        ("critical_set", {"resolution": np.array(np.nan)}),
+        ("extended_sets", {"room": np.empty(0, "U1")}),
+        (
+            "extended_sets",
+            {"points": np.zeros((1, 1)), "room": np.zeros(1), "between": np.array([[7, 8]])},
+        ),
+        ("arcs/start0_policy", {}),
+    ],
+)
+def test_numbers_of_a_run_are_of_their_kind(name, arrays, planted_circle, tmp_path):
+    run = hyrl_mj.load_run(shutil.copytree(planted_circle[0].path, tmp_path / "run"))
+    if name.startswith("arcs"):
+        arrays = {"z": np.ones(run.arc(run.path / f"{name}.npz").z.shape, bool)}
+    forgery.arrays(run.path, f"{name}.npz", **arrays)
+    with pytest.raises(BadInput, match=r"make no|does not fit"):
+        _ = run.anew().critical_set, run.extended_sets, run.arcs()
 
 
 def test_an_arc_is_as_long_as_its_run_at_most(planted_circle, tmp_path):
