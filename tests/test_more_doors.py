@@ -2,6 +2,7 @@
 
 import contextlib
 import csv
+import errno
 import importlib.util
 import io
 import json
@@ -31,6 +32,7 @@ from PIL import Image
 import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, HyrlError, from_gymnasium
 from hyrl_mj.cli import parsing
+from hyrl_mj.export import export_numpy
 from hyrl_mj.fields import read_field
 from hyrl_mj.files import archives, artifacts, trust
 from hyrl_mj.files.manifest import Manifest, locked
@@ -122,6 +124,24 @@ def test_a_new_task_replaces_no_link_that_leads_to_nothing(tmp_path):
     with pytest.raises(BadInput, match="exists already"):
         write_task("robot_3", tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["robot_3.xml"]
+
+
+@pytest.mark.parametrize(("form", "last"), [("text", ".xml"), ("bytes", ".py")])
+def test_files_that_belong_together_are_written_together(
+    form, last, planted_circle, tmp_path, monkeypatch
+):
+    write = getattr(Path, f"write_{form}")
+
+    def on_full_disk(path, *content, **options):
+        if path.suffix == last and tmp_path in path.parents:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(path, *content, **options)
+
+    controller = planted_circle[0].controller
+    monkeypatch.setattr(Path, f"write_{form}", on_full_disk)
+    with pytest.raises(BadInput, match="No space left"):
+        write_task("robot_4", tmp_path) if form == "text" else export_numpy(controller, tmp_path)
+    assert not os.listdir(tmp_path)
 
 
 def test_a_path_without_a_name_is_one_sentence():
