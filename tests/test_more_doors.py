@@ -37,7 +37,7 @@ from hyrl_mj.fields import read_field
 from hyrl_mj.files import archives, artifacts, trust
 from hyrl_mj.files.manifest import Manifest, locked
 from hyrl_mj.files.sources import digest_of
-from hyrl_mj.gym_import import making
+from hyrl_mj.gym_import import EnvironmentOptions, chosen_task, making
 from hyrl_mj.gym_import.making import explained
 from hyrl_mj.gym_import.opening import with_arrays
 from hyrl_mj.physics import mjcf
@@ -441,6 +441,11 @@ def test_an_array_holds_numbers():
         making.from_spec('env:{"array": ["a"]}')
 
 
+def test_arguments_have_a_length():
+    with pytest.raises(BadInput, match="take more than 1,048,576 characters"):
+        from_gymnasium(ENV, pinned={f"k{i}": 1 for i in range(200_000)})
+
+
 def test_arguments_that_are_nested_far_are_one_sentence():
     deep = []
     for _ in range(3_000):
@@ -475,11 +480,14 @@ def test_a_figure_on_a_full_disk_is_one_sentence(tmp_path, monkeypatch, circle):
     assert sorted(os.listdir(tmp_path)) == ["a.pdf", "a.png"]
 
 
-def test_arguments_of_an_environment_have_a_limit(tmp_path):
-    (tmp_path / "large.json").write_text(json.dumps({"kwargs": {"a": [[]] * 2_000_000}}))
-    done = call("diagnose", "--explain", "--env", ENV, "--env-args", "large.json", cwd=tmp_path)
-    assert done.returncode == 2
-    assert "is larger than 4 MiB" in done.stderr
+@pytest.mark.parametrize(
+    ("size", "message"), [(400_000, "is larger than 1 MiB"), (20_000, "more than 10,000 parts")]
+)
+def test_arguments_of_an_environment_have_a_limit(size, message, tmp_path):
+    (tmp_path / "large.json").write_text(json.dumps({"kwargs": {"a": [[]] * size}}))
+    options = EnvironmentOptions(ENV, env_args=tmp_path / "large.json")
+    with pytest.raises(BadInput, match=message):
+        chosen_task(None, options)
 
 
 @pytest.mark.parametrize("name", ["interval_s", "time_s"])
