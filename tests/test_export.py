@@ -285,6 +285,16 @@ def test_the_folder_needs_numpy_alone(vehicle, tmp_path):
             np.testing.assert_allclose(there, here, atol=1e-6)
 
 
+def test_files_of_two_exports_are_no_controller(circle, tmp_path):
+    first, second = (planted(circle, activation=name) for name in ("relu", "tanh"))
+    written = export_numpy(first, tmp_path)
+    arrays = written[1].read_bytes()
+    as_numpy(second, tmp_path)
+    written[1].write_bytes(arrays)  # as where a process was ended between the two
+    with pytest.raises(ImportError, match="of another export"):
+        exec(written[0].read_text(), {"__file__": str(written[0])})
+
+
 def test_both_loops_of_the_manual_drive_alike(vehicle, tmp_path, monkeypatch):
     page = (Path(__file__).parents[1] / "docs" / "export.md").read_text(encoding="utf-8")
     blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)

@@ -2,6 +2,7 @@
 
 import contextlib
 import csv
+import errno
 import importlib.util
 import io
 import json
@@ -22,7 +23,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from attacks import MARKER, child, crafted_agents
+from attacks import MARKER, child, crafted_agents, forgery
 from attacks.folders import plant_modules
 from command_line import call
 from environments import Puck
@@ -31,11 +32,12 @@ from PIL import Image
 import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, HyrlError, from_gymnasium
 from hyrl_mj.cli import parsing
+from hyrl_mj.export import export_numpy
 from hyrl_mj.fields import read_field
 from hyrl_mj.files import archives, artifacts, trust
 from hyrl_mj.files.manifest import Manifest, locked
 from hyrl_mj.files.sources import digest_of
-from hyrl_mj.gym_import import making
+from hyrl_mj.gym_import import EnvironmentOptions, chosen_task, making
 from hyrl_mj.gym_import.making import explained
 from hyrl_mj.gym_import.opening import with_arrays
 from hyrl_mj.physics import mjcf
@@ -122,6 +124,24 @@ def test_a_new_task_replaces_no_link_that_leads_to_nothing(tmp_path):
     with pytest.raises(BadInput, match="exists already"):
         write_task("robot_3", tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["robot_3.xml"]
+
+
+@pytest.mark.parametrize(("form", "last"), [("text", ".xml"), ("bytes", ".py")])
+def test_files_that_belong_together_are_written_together(
+    form, last, planted_circle, tmp_path, monkeypatch
+):
+    write = getattr(Path, f"write_{form}")
+
+    def on_full_disk(path, *content, **options):
+        if path.suffix == last and tmp_path in path.parents:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(path, *content, **options)
+
+    controller = planted_circle[0].controller
+    monkeypatch.setattr(Path, f"write_{form}", on_full_disk)
+    with pytest.raises(BadInput, match="No space left"):
+        write_task("robot_4", tmp_path) if form == "text" else export_numpy(controller, tmp_path)
+    assert not os.listdir(tmp_path)
 
 
 def test_a_path_without_a_name_is_one_sentence():
@@ -421,6 +441,11 @@ def test_an_array_holds_numbers():
         making.from_spec('env:{"array": ["a"]}')
 
 
+def test_arguments_have_a_length():
+    with pytest.raises(BadInput, match="take more than 1,048,576 characters"):
+        from_gymnasium(ENV, pinned={f"k{i}": 1 for i in range(200_000)})
+
+
 def test_arguments_that_are_nested_far_are_one_sentence():
     deep = []
     for _ in range(3_000):
@@ -455,11 +480,14 @@ def test_a_figure_on_a_full_disk_is_one_sentence(tmp_path, monkeypatch, circle):
     assert sorted(os.listdir(tmp_path)) == ["a.pdf", "a.png"]
 
 
-def test_arguments_of_an_environment_have_a_limit(tmp_path):
-    (tmp_path / "large.json").write_text(json.dumps({"kwargs": {"a": [[]] * 2_000_000}}))
-    done = call("diagnose", "--explain", "--env", ENV, "--env-args", "large.json", cwd=tmp_path)
-    assert done.returncode == 2
-    assert "is larger than 4 MiB" in done.stderr
+@pytest.mark.parametrize(
+    ("size", "message"), [(400_000, "is larger than 1 MiB"), (20_000, "more than 10,000 parts")]
+)
+def test_arguments_of_an_environment_have_a_limit(size, message, tmp_path):
+    (tmp_path / "large.json").write_text(json.dumps({"kwargs": {"a": [[]] * size}}))
+    options = EnvironmentOptions(ENV, env_args=tmp_path / "large.json")
+    with pytest.raises(BadInput, match=message):
+        chosen_task(None, options)
 
 
 @pytest.mark.parametrize("name", ["interval_s", "time_s"])
@@ -539,6 +567,31 @@ def test_modes_are_integers(modes, planted_circle, tmp_path):
         np.savez(tmp_path / "e.npz", **{**arrays, "modes": modes})
     with pytest.raises(BadArtifact, match="its modes cannot be used: its numbers are no integers"):
         ExtendedSets.load(tmp_path / "e.npz", hyrl_mj.get_task("unit_circle"))
+
+
+@pytest.mark.parametrize(
+    ("name", "arrays"),
+    [
+        ("critical_set", {"points": np.ones((1, 1), bool)}),
+        ("critical_set", {"points": np.full((1, 1), 1e308)}),
+        ("critical_set", {"component": np.array(["x"])}),
+        ("critical_set", {"component": np.full(1, 2**64 - 1, np.uint64)}),
+        ("critical_set", {"resolution": np.array(np.nan)}),
+        ("extended_sets", {"room": np.empty(0, "U1")}),
+        (
+            "extended_sets",
+            {"points": np.zeros((1, 1)), "room": np.zeros(1), "between": np.array([[7, 8]])},
+        ),
+        ("arcs/start0_policy", {}),
+    ],
+)
+def test_numbers_of_a_run_are_of_their_kind(name, arrays, planted_circle, tmp_path):
+    run = hyrl_mj.load_run(shutil.copytree(planted_circle[0].path, tmp_path / "run"))
+    if name.startswith("arcs"):
+        arrays = {"z": np.ones(run.arc(run.path / f"{name}.npz").z.shape, bool)}
+    forgery.arrays(run.path, f"{name}.npz", **arrays)
+    with pytest.raises(BadInput, match=r"make no|does not fit"):
+        _ = run.anew().critical_set, run.extended_sets, run.arcs()
 
 
 def test_an_arc_is_as_long_as_its_run_at_most(planted_circle, tmp_path):

@@ -190,6 +190,17 @@ def test_a_stranger_s_sweep_leads_nowhere_else(tmp_path):
         report(tmp_path)
 
 
+@pytest.mark.parametrize(
+    "other", [(Setting("unit_circle", "", 0.2), 0), (Setting("unit_circle", "", 0.1), 1)]
+)
+def test_a_run_of_another_row_is_not_shown(other, planted_circle, tmp_path):
+    row, moved = Row(Setting("unit_circle", "", 0.1), 0), Row(*other)
+    for one in (row, moved):
+        shutil.copytree(planted_circle[0].path, tmp_path / one.name)
+    assert row.on_disk(tmp_path).done
+    assert "holds a run of unit_circle, " in moved.on_disk(tmp_path).sentence
+
+
 def test_shares_of_episodes_are_of_all_start_regions():
     counts = tuple(
         EpisodeCount(

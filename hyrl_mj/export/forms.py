@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
+from contextlib import ExitStack
+from hashlib import sha256
 from pathlib import Path
 from runpy import run_path
 from typing import TYPE_CHECKING, Any
@@ -50,8 +52,9 @@ def export_numpy(controller: Exportable, folder: str | Path) -> list[Path]:
     with tempfile.TemporaryDirectory() as temporary:
         written = _write(controller, Path(temporary))
         _check(controller, run_path(str(written[0]))["step"], "the NumPy form")
-        for source in reversed(written):  # the arrays first
-            with artifacts.replacing(folder / source.name) as partial:
+        with ExitStack() as stack:  # all is written before anything is renamed, the arrays first
+            for source in written:
+                partial = stack.enter_context(artifacts.replacing(folder / source.name))
                 partial.write_bytes(source.read_bytes())
     return [folder / source.name for source in written]
 
@@ -134,6 +137,15 @@ def _write(controller: Exportable, folder: Path) -> tuple[Path, Path]:
         task_part = _constants(controller.task) + "\n\n\n"
         checks = text[end : text.index("LOW, SIDES, PERIODIC =")]
         text = text[:begin] + task_part + checks + _traced_step(controller, arrays)
+    # By this both files know each other: a process may be ended between their renames.
+    digest = sha256(text.encode())
+    for name, array in arrays.items():
+        digest.update(name.encode() + np.asarray(array).tobytes())
+    export = digest.hexdigest()
+    text, arrays["export"] = (
+        text.replace('EXPORT = "name"', f'EXPORT = "{export}"'),
+        np.array(export),
+    )
     path = folder / TEMPLATE.name
     path.write_text(text, encoding="utf-8")
     artifacts.write_arrays(path.with_suffix(".npz"), arrays, kind="controller")

@@ -196,8 +196,7 @@ def parsed_json(
     text: str, kind: str, parse: Callable[[dict[str, Any]], Record], remedy: str = REMEDY
 ) -> Record:
     """Returns what `read_json` does, of the text of a file."""
-    if text.count("[") + text.count("{") > MOST_PARTS:
-        raise BadArtifact(f"it has more than {MOST_PARTS:,} parts, which no such file has")
+    check_parts(text)
     whole = json.loads(text)
     if not isinstance(whole, dict):
         raise BadArtifact("it holds no JSON object")
@@ -212,6 +211,12 @@ def parsed_json(
             f"it was changed after it was written (its sha256 does not fit): {remedy}"
         )
     return value
+
+
+def check_parts(text: str) -> None:
+    """Raises `BadArtifact` if the text of a JSON file has more than `MOST_PARTS` lists and objects."""
+    if text.count("[") + text.count("{") > MOST_PARTS:
+        raise BadArtifact(f"it has more than {MOST_PARTS:,} parts, which no such file has")
 
 
 def _unprintable(content: Any) -> Iterator[str]:

@@ -38,6 +38,9 @@ _MADE: MutableMapping[str, EnvironmentTask] = WeakValueDictionary()
 _RECENT: deque[EnvironmentTask] = deque(maxlen=2)
 # Older tasks of functions of the same name.
 _OLDER: WeakSet[EnvironmentTask] = WeakSet()
+LARGEST = (
+    2**20
+)  # of a file of arguments [bytes], each of which is copied, compared and written down
 
 
 def from_gymnasium(
@@ -94,6 +97,11 @@ def from_gymnasium(
         if starts == "chart":
             del told["starts"]
         spec = ENVIRONMENT + json.dumps(told, default=_plain)
+        if len(spec) > LARGEST:
+            raise BadInput(
+                f"the arguments of {_shown(env)} take more than {LARGEST:,} characters: give what they hold "
+                "to a function that makes it"
+            )
         # Their user may change them later.
         owned = {name: copy.deepcopy(value) for name, value in given.items() if name != "env"}
         description = replace(description, **owned)
@@ -331,9 +339,12 @@ _INSTEAD = {
 
 
 def _arguments(path: Path) -> dict[str, Any]:
-    text = artifacts.read_given(path, "give a JSON file")
+    text = artifacts.read_given(path, "give a JSON file", LARGEST)
     try:
-        content = json.loads(text.decode(), object_hook=with_arrays)
+        artifacts.check_parts(whole := text.decode())
+        content = json.loads(whole, object_hook=with_arrays)
+    except BadInput as error:
+        raise BadInput(f"{path} cannot be used: {error}") from None
     except (ValueError, RecursionError) as error:
         raise BadInput(f"{path} is no JSON ({brief(error)}): give a JSON file") from None
     if not isinstance(content, dict):

@@ -94,6 +94,14 @@ class Row:
             return row.stopped(str(error))
         if run is None:
             return row
+        own, other = self.setting, run.settings
+        named = Path(own.task).stem, own.eps, self.seed, own.algorithm or other.stage1.algorithm
+        found = Path(other.task).stem, other.eps, other.seed, other.stage1.algorithm
+        if found != named:
+            return row.stopped(
+                f"its folder holds a run of {found[0]}, {found[3]}, noise {other.eps:g}, seed {other.seed}: "
+                "put it back to where it was made, and remove what lies here"
+            )
         verdict = run.verdict
         return replace(
             row,

@@ -68,7 +68,7 @@ class HybridArc(Saved):
         tables = {"z": self.z, "measured": self.measured, "u": self.u, "state": self.state}
         fits = all(np.shape(a) == (rows,) for a in (self.t, self.j, self.q))
         fits = fits and all(np.ndim(a) == 2 and len(a) == rows for a in tables.values())
-        numbers = all(np.asarray(a).dtype.kind in "biuf" for a in (self.t, *tables.values()))
+        numbers = all(np.asarray(a).dtype.kind in "iuf" for a in (self.t, *tables.values()))
         counts = all(np.issubdtype(np.asarray(a).dtype, np.integer) for a in (self.q, self.j))
         if not (rows and fits and numbers and counts and np.isfinite(self.t).all()):
             raise BadInput("these arrays make no arc: give numbers in one row for each sample")

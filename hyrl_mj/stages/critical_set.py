@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from hyrl_mj.errors import BadInput, counted, unknown
+from hyrl_mj.errors import LARGEST_NUMBER, BadInput, counted, unknown
 from hyrl_mj.files.artifacts import Saved
 from hyrl_mj.learning import WaySettings
 from hyrl_mj.policies import Policy
@@ -37,13 +37,15 @@ class CriticalSet(Saved):
     spacing: float
 
     def __post_init__(self) -> None:
-        if self.points.ndim != 2 or self.component.shape != (len(self.points),):
+        fits = self.points.ndim == 2 and self.component.shape == (len(self.points),)
+        if not fits or self.points.dtype.kind not in "if" or self.component.dtype.kind != "i":
             raise BadInput(
                 f"points of shape {self.points.shape} and components of shape {self.component.shape} make "
                 "no critical set: give points (N, d) and one component (N,) for each"
             )
-        if not np.isfinite(self.points).all():
-            raise BadInput("points of M* that are not finite make no critical set")
+        numbers = (self.points, self.resolution, self.spacing)
+        if not all((np.abs(number) <= LARGEST_NUMBER).all() for number in numbers):
+            raise BadInput("numbers of M* that are not finite make no critical set")
 
     def __repr__(self) -> str:
         return f"CriticalSet({self._counts}, resolution {self.resolution:.3g})"

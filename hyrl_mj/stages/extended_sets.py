@@ -60,11 +60,12 @@ class ExtendedSets(Saved):
 
     def __post_init__(self) -> None:
         check_sets(self.modes, self.sets, self.winning)
-        k = len(self.points)
-        if self.room.shape != (k,) or self.between.shape != (k, 2):
+        k, kinds = len(self.points), [a.dtype.kind for a in (self.points, self.room, self.between)]
+        fits = self.room.shape == (k,) and self.between.shape == (k, 2) and kinds == ["f", "f", "i"]
+        if not (fits and np.isin(self.between, self.modes).all()):
             raise BadInput(
                 f"room of shape {self.room.shape} between modes of shape {self.between.shape} does not fit "
-                f"{k} points of M*: give ({k},) and ({k}, 2)"
+                f"{k} points of M* and modes {self.modes}: give ({k},) and ({k}, 2)"
             )
 
     def __repr__(self) -> str:

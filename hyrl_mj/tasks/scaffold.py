@@ -2,6 +2,7 @@
 
 import keyword
 import re
+from contextlib import ExitStack
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -47,8 +48,9 @@ def write_task(name: str, folder: Path) -> list[Path]:
         raise BadInput(f"{existing[0]} exists already: choose another name, or another folder")
     token = artifacts.before_writing.set(lambda path, temporary: True)
     try:
-        for path, text in texts.items():
-            with artifacts.replacing(path) as temporary:
+        with ExitStack() as stack:  # all are written before one is there
+            for path, text in texts.items():
+                temporary = stack.enter_context(artifacts.replacing(path))
                 temporary.write_text(text, encoding="utf-8")
     finally:
         artifacts.before_writing.reset(token)

@@ -13,6 +13,10 @@ import numpy as np
 with np.load(__file__.rpartition(".")[0] + ".npz", allow_pickle=False) as file:
     ARRAYS = {name: file[name] for name in file.files}
 
+EXPORT = "name"
+if ARRAYS.pop("export", None) != EXPORT:
+    raise ImportError("controller.npz is of another export than controller.py: export them again")
+
 MODES = ARRAYS["modes"]
 NO_MODE = -1  # stands for "in no mode yet"
 
