@@ -19,7 +19,7 @@ import numpy as np
 
 from hyrl_mj.errors import BadInput, brief
 from hyrl_mj.tracing.traced_array import Operation, Program, Traced, apply, take
-from hyrl_mj.tracing.vocabulary import BATCH, Untraceable
+from hyrl_mj.tracing.vocabulary import BATCH, REDUCTIONS, Untraceable
 
 
 def trace(
@@ -77,12 +77,22 @@ def _filled(original: Callable[..., np.ndarray], *args: Any, **kwargs: Any) -> A
 
 def _converted(original: Callable[..., Any], x: Any, dtype: Any = None, **kwargs: Any) -> Any:
     """Does np.asarray(x), np.array([x, y]) and the like."""
-    if isinstance(x, list | tuple) and any(isinstance(part, Traced) for part in x):
-        x = np.stack(x)
+    x = _joined(x)
     if not isinstance(x, Traced):
         return original(x, dtype, **kwargs)
     copy = original is np.array and kwargs.get("copy", True)
     return x.astype(x.dtype if dtype is None else dtype, copy=bool(copy))
+
+
+def _reduced(original: Callable[..., Any], x: Any, *args: Any, **kwargs: Any) -> Any:
+    """Does np.min([x, y], axis=0) and the like."""
+    return original(_joined(x), *args, **kwargs)
+
+
+def _joined(x: Any) -> Any:
+    """Returns an array of a list of arrays that are traced; anything else itself."""
+    traced = isinstance(x, list | tuple) and any(isinstance(part, Traced) for part in x)
+    return np.stack(x) if traced else x
 
 
 def _take(x: Any, indices: Any, *args: Any, **kwargs: Any) -> Any:
@@ -94,6 +104,10 @@ REPLACEMENTS: dict[str, Callable[..., Any]] = {
     **{
         name: partial(_converted, getattr(np, name))
         for name in ("array", "asarray", "asanyarray", "ascontiguousarray")
+    },
+    **{
+        name: partial(_reduced, getattr(np, name))
+        for name in (*REDUCTIONS, "amax", "amin", "mean", "prod")
     },
     "take": _take,
 }
