@@ -197,7 +197,7 @@ def test_what_cannot_be_bounded_is_attacked_all_the_same(vehicle):
 
 @pytest.mark.slow
 def test_an_examination_carries_what_is_proved(vehicle, monkeypatch):
-    monkeypatch.setattr(examination, "CURVE", (0.0, EPS))
+    monkeypatch.setattr(examination, "CURVE", (0.0, 1 / 3))
     monkeypatch.setattr(examination, "_replays", lambda certificate, scores: ())
     loops = {"policy": PolicyController(sideways(vehicle, 1, 1.1)), "hyrl": hybrid(vehicle)}
     result, maps = examination.worst_case(

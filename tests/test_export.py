@@ -1,5 +1,6 @@
 """An exported controller does what the controller does, in both forms."""
 
+import copy
 import re
 import subprocess
 import sys
@@ -479,6 +480,7 @@ WHOLE = {
     "full": lambda x: np.full((len(x), 2), 0.5) + np.full_like(x[:, :2], 2) + np.zeros_like(x[:, 1:]),
     "full of a row": lambda x: x * np.full((len(x), 3), [1.0, 2.0, 3.0]),
     "under other names": under_other_names,
+    "deep copies": lambda x: copy.deepcopy(x) + copy.copy(x),
     "indices": lambda x: np.concatenate([x[:, [2, 0]], x[:, -1:], x[:, 1][:, None]], axis=1),
     "mask of columns": lambda x: x[:, np.array([True, False, True])],
     "take": lambda x: np.take(np.linspace(0, 1, 50), np.clip(x * 9 + 20, 0, 49).astype(int)),

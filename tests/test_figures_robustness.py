@@ -21,7 +21,6 @@ from hyrl_mj.judging.game.result import (
     Profile,
     WinningShares,
 )
-from hyrl_mj.judging.game.scores import CURVE
 from hyrl_mj.sets import Grid
 from hyrl_mj.viz import colours, figures
 from hyrl_mj.viz.figures import robustness, style
@@ -31,6 +30,7 @@ WON, WON_FROM_SOME, UNCLEAR, BEATEN, UNWINNABLE, OVER = MapClass
 
 CIRCLE, VEHICLE = hyrl_mj.get_task("unit_circle"), hyrl_mj.get_task("vehicle")
 HYRL = colours.MODES[0]
+CURVE = tuple(np.linspace(0, 0.3, 25).tolist())
 DPI = style.DPI
 
 

@@ -1,5 +1,8 @@
 """Scores, margins and maps of the worst-case game, and the files they go into."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from planted import (
@@ -16,8 +19,17 @@ from planted import (
 
 from hyrl_mj import BadArtifact, BadInput, Noise, simulate
 from hyrl_mj.files import artifacts
-from hyrl_mj.judging import worst_case as examination
-from hyrl_mj.judging.game import CURVE, LIMIT, Game, MapClass, Robustness, worst_signal
+from hyrl_mj.judging import margin_text, worst_case as examination
+from hyrl_mj.judging.game import (
+    CURVE,
+    LIMIT,
+    Curve,
+    Game,
+    MapClass,
+    Robustness,
+    largest_bound,
+    worst_signal,
+)
 from hyrl_mj.judging.game.solver import NEVER
 from hyrl_mj.judging.worst_case import worst_case
 from hyrl_mj.policies.controllers import PolicyController
@@ -132,6 +144,24 @@ def test_noise_beyond_what_was_prepared_is_refused(on_vehicle):
 def test_a_game_under_noise_that_hides_everything_is_refused(vehicle):
     with pytest.raises(BadInput, match=r"noise bound 1.5 hides the whole state space of vehicle"):
         Game(vehicle, halves(vehicle, 60), {}, 1.5)
+
+
+@pytest.mark.parametrize(
+    ("eps", "largest"), [(0.0, 0.3), (0.1, 0.3), (0.2, 0.6), (0.45, 1.2), (1.4, 1.4)]
+)
+def test_the_curve_goes_as_far_as_the_bound_of_a_run_and_the_chart_ask_for(vehicle, eps, largest):
+    assert largest_bound(vehicle, eps, everywhere=True) == largest
+    vehicle.check_noise(largest)
+    small = type("Small", (type(vehicle),), {"chart": replace(vehicle.chart, high=(0.1, -1.45))})()
+    assert largest_bound(small, eps / 80, everywhere=False) <= 0.02  # of a side of 0.05
+
+
+def test_a_margin_that_nothing_tried_exceeds_is_at_least_that(vehicle):
+    game = SimpleNamespace(
+        curve=Curve((0.0, 0.3), (), {}), lattice=SimpleNamespace(spacing=(0.01,))
+    )
+    texts = [margin_text(margin, "m", game) for margin in (None, 0.28, 0.2951)]
+    assert texts == ["none", "0.28 m", "at least 0.295 m"]
 
 
 # ---- the time of an episode

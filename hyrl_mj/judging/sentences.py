@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hyrl_mj.errors import counted
-from hyrl_mj.judging.game import NO_NOISE, Comparison, ReplayCount, Score, percent
+from hyrl_mj.judging.game import NO_NOISE, Comparison, GameResult, ReplayCount, Score, percent
 from hyrl_mj.judging.results import ModeResult
 from hyrl_mj.tasks import Task
 
@@ -47,9 +47,15 @@ def replays_sentence(task: Task, count: ReplayCount) -> str:
     )
 
 
-def margin_text(margin: float | None, unit: str) -> str:
-    """Returns a margin with its unit; "none" where some run is lost even without noise."""
-    return "none" if margin is None else f"{margin:.3g} {unit}"
+def margin_text(margin: float | None, unit: str, game: GameResult) -> str:
+    """Returns a margin of a game with its unit; "none" where some run is lost even without noise.
+
+    It is "at least" so much where no larger noise was tried, but for a cell of the lattice.
+    """
+    if margin is None:
+        return "none"
+    least = margin > game.curve.eps[-1] - max(game.lattice.spacing)
+    return f"{'at least ' * least}{margin:.3g} {unit}"
 
 
 def share_sentence(score: Score) -> str:

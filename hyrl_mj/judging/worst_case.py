@@ -9,7 +9,6 @@ import numpy as np
 
 from hyrl_mj.judging.game import (
     CURVE,
-    LARGEST,
     LIMIT,
     NEARLY,
     NEVER,
@@ -27,6 +26,7 @@ from hyrl_mj.judging.game import (
     SensedScore,
     WinningShares,
     curve_grid,
+    largest_bound,
     lattice_grid,
     share,
 )
@@ -75,7 +75,7 @@ def worst_case(
     Lattice.check(task, grid)
     exact = Lattice.decides(task, grid) and not why_no_cells(task, grid.counts)
     curves = curves and exact  # a coarser lattice would estimate nothing
-    largest = max(*bounds, LARGEST) if curves else max(bounds)
+    largest = largest_bound(task, max(bounds), everywhere) if curves else max(bounds)
     fine = Game(task, parts, controllers, largest, everywhere, grid)
     certificate = Certificate.certify(fine, controllers)
     scores, maps = _scores(certificate, bounds)
@@ -180,21 +180,22 @@ def _map(certificate: Certificate, name: str, eps: float) -> np.ndarray:
 
 
 def _sweep(certificate: Certificate, points: np.ndarray) -> tuple[Curve, Profile]:
-    """Returns the curve over `CURVE`, and the profile of the noise that points (N, d) of M* bear."""
+    """Returns the curve up to the game's largest bound, and the noise that points (N, d) of M* bear."""
+    bounds = tuple(float(f"{certificate.game.largest * part:.10g}") for part in CURVE)
     game, names = certificate.game, [*certificate.controllers, LIMIT]
     task, dt = game.task, game.task.dt
     along = points[task.may_start(points)]
     at = game.lattice.grid.nearest(along)
-    games = [(name, eps) for eps in CURVE for name in names]
+    games = [(name, eps) for eps in bounds for name in names]
     values = _in_threads("worst-case curve", game.value, games)
-    regions = [game.starts & game.winnable(eps) for eps in CURVE]
-    proofs = [(name, eps) for name in certificate.answers for eps in CURVE]
+    regions = [game.starts & game.winnable(eps) for eps in bounds]
+    proofs = [(name, eps) for name in certificate.answers for eps in bounds]
     proved = _in_threads("proofs", certificate.wins, proofs)
     wins, borne = {}, {}
     for name in names:
         holds, bears = np.ones(len(along), dtype=bool), np.full(len(along), np.nan)
         rows: list[tuple[float, float, float | None]] = []
-        for eps, region in zip(CURVE, regions, strict=True):
+        for eps, region in zip(bounds, regions, strict=True):
             value = values[name, eps][:, :-2]
             first, worst = value[-1], value[:-1].max(axis=0)
             after = worst[region & (worst < NEVER)]
@@ -202,14 +203,14 @@ def _sweep(certificate: Certificate, points: np.ndarray) -> tuple[Curve, Profile
             rows.append((share(first[region] < NEVER), share(worst[region] < NEVER), time_any))
             holds &= first[at] < NEVER
             bears[holds] = eps
-        of_cells = [proved[name, eps] for eps in CURVE if name in certificate.answers]
+        of_cells = [proved[name, eps] for eps in bounds if name in certificate.answers]
         own, some = (tuple(found[i] for found in of_cells) for i in range(2))
         won, won_any, times = zip(*rows, strict=True)
         wins[name] = WinningShares(won, won_any, own, some, times)
         borne[name] = tuple(None if np.isnan(x) else float(x) for x in bears)
     winnable = tuple(float(region.sum() / max(game.starts.sum(), 1)) for region in regions)
     profile = Profile(tuple(tuple(point) for point in along.tolist()), borne)
-    return Curve(CURVE, winnable, wins), profile
+    return Curve(bounds, winnable, wins), profile
 
 
 def _known(bounds: tuple[float, ...], scores: Mapping[str, tuple[Score, ...]]) -> Curve:

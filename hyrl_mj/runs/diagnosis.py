@@ -150,26 +150,26 @@ def sentences(
     unit = task.noise_on(robustness.everywhere)[1]
     results = [f"it {run.arrivals}", run.critical_set.sentence(task)]
     noise = f"noise of up to {task.noise_text(eps, robustness.everywhere)}"
-    if robustness.deciding is not None:
-        score = robustness.deciding.scores["policy"][-1]
+    if (game := robustness.deciding) is not None:
+        score = game.scores["policy"][-1]
         lost = percent(1 - score.not_broken)
         if losses is not None and len(losses.unaided):
             results.append(f"without noise it loses {len(losses.unaided):,} nodes that can be won")
         results.append(
             f"signals of {noise} are known that make it lose {lost} of the winnable starts"
         )
-        replays = robustness.deciding.replays_of("policy")
+        replays = game.replays_of("policy")
         if replays and replays.failures:
             results.append(replays_sentence(task, replays))
         elif score.proved is not None:
             results.append(f"it is proved to win {percent(score.proved)} of them")
         if losses is not None:
             results.append(losses_sentence(losses))
-        if (margin := robustness.deciding.margin["policy"]) is None:
+        if (margin := game.margin["policy"]) is None:
             results.append("on the nodes it does not win all of them even without noise")
         else:
             results.append(
-                f"on the nodes it wins all of them up to noise {margin_text(margin, unit)}"
+                f"on the nodes it wins all of them up to noise {margin_text(margin, unit, game)}"
             )
     else:
         if run.agent and run.agent.why_no_function:

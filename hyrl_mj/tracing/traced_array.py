@@ -140,7 +140,10 @@ class Traced(NDArrayOperatorsMixin):
             raise Untraceable(f"uses .{name} of an array, which cannot be traced")
         return partial(_call, function, self)
 
-    T = property(transpose)
+    def __copy__(self, _: Any = None) -> Any:
+        return np.copy(self)
+
+    T, __deepcopy__ = property(transpose), __copy__
 
     def __bool__(self) -> bool:
         raise Untraceable("branches on values: use np.where")

@@ -228,9 +228,9 @@ def margin_table(task: Task, game: GameResult) -> Table:
     rows = [
         {
             "controller": NAMES[who],
-            "largest noise without a lost state": margin_text(margin, unit),
+            "largest noise without a lost state": margin_text(margin, unit, game),
             f"{100 * NEARLY:.0f}% is proved up to noise": margin_text(
-                game.proved_margin[who], unit
+                game.proved_margin[who], unit, game
             ),
             f"off the set-point at most, no noise [{miss_unit(task)}]": f"{game.miss_without_noise[who]:.3f}",
         }

@@ -17,9 +17,18 @@ from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.simulation import LoopSettings, Recorded, Signal, closed_loop
 from hyrl_mj.tasks import Task
 
-# The largest noise bound of the curve, and its bounds [chart units].
-LARGEST = 0.3
-CURVE = tuple(round(0.0125 * k, 4) for k in range(round(LARGEST / 0.0125) + 1))
+# The bounds of the curve, as shares of the largest; and how large that is at least [chart units].
+CURVE, LARGEST = tuple(k / 24 for k in range(25)), 0.3
+
+
+def largest_bound(task: Task, eps: float, everywhere: bool) -> float:
+    """Returns the largest noise bound of the curve of a run: three times its own, eps, or `LARGEST`.
+
+    It is no more than 0.4 of the noisy sides of the chart, of which noise of 0.5 tells nothing.
+    """
+    share = task.noise_in_chart(1.0, everywhere)
+    most = 0.4 * float((task.chart.sides[share > 0] / share[share > 0]).min())
+    return max(eps, float(f"{min(max(3 * eps, LARGEST), most):.10g}"))
 
 
 class Game:
