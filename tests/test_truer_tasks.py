@@ -621,7 +621,11 @@ def test_an_obstacle_on_a_body_that_stands_still_is_where_it_is_in_the_world(tmp
 
 @pytest.mark.parametrize(
     ("ending", "outcome"),
-    [(PY["ending"], "stalled"), ("ends = np.zeros(len(measured), int)", "reached")],
+    [
+        (PY["ending"], "stalled"),
+        ("ends = np.where(measured[:, 0] > 5.0, int(Outcome.REACHED), 0)", "stalled"),
+        ("ends = np.zeros(len(measured), int)", "reached"),
+    ],
 )
 def test_who_is_still_under_way_has_not_arrived_where_the_end_says_who_has(
     ending, outcome, tmp_path
