@@ -137,7 +137,8 @@ def check_copied(spec: EnvironmentSpec) -> None:
     """Raises `BadInput` if what is observed shows the place by what code copies into MuJoCo's state.
 
     A copy, as of a camera that is put above the robot, is moved by as much as the robot, whatever it was
-    before. Noise on the chart does not reach it.
+    before. What follows the place in `userdata`, where no physics writes, is one, too, also
+    scaled or filtered. Noise on the chart does not reach it.
     """
     rng, one, step = np.random.default_rng(15), Instance(spec), spec.nudge
     columns, far = one.physics.columns, float(step.max())
@@ -158,7 +159,9 @@ def check_copied(spec: EnvironmentSpec) -> None:
         here, there, after = (run[-1].state for run in runs)
         by = np.append(step, (there - here)[spec.places])
         moved = np.abs((there - here)[others, None] - by[by != 0]) <= SAME * far
-        copies = others[moved.any(axis=1) & (np.abs(after - here)[others] <= SAME * far)]
+        is_copy = moved.any(axis=1) & (np.abs(after - here)[others] <= SAME * far)
+        noted = np.isin(others, columns["userdata"]) & (there != here)[others]
+        copies = others[is_copy | noted]
         if not len(copies):
             continue
         other, one = here.copy(), renewed(one)
