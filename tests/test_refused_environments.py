@@ -140,7 +140,7 @@ KINDS = {
     "sleep": (Sleepy, "Sleepy cannot be used: puck lets bodies sleep, .*: leave <flag sleep"),
     "floats in whole numbers": (
         Whole,
-        r"observes [-\d.]+ in observation\[0\], .*int64,.* SB3 show agents -?\d:",
+        r"observes .* in observation\[0\], .*int64,.* SB3 shows agents",
     ),
     "more than its space": (Longer, "observes 7 number"),
     "a slow reset": (Slow, r"reset\(\) of Slow takes 3.* s"),
@@ -504,6 +504,13 @@ class Chasing(Rigged):
         mujoco.mj_forward(self.model, self.data)
 
 
+class Filtered(InUserdata):
+    """An average of where it was is observed."""
+
+    def after(self):
+        self.data.userdata[:] += 0.2 * (self.data.qpos[:2] - self.data.userdata)
+
+
 FOLLOWS, COPIES = "does not follow its state", "observes shows {}.*, to which code copies the place"
 OBSERVED = {
     "by no known method": (Unseen, "no method that computes what it observes"),
@@ -522,6 +529,7 @@ OBSERVED = {
     "in the room": (Clipped, r"step\(\) of Clipped changes what _get_obs\(\) gives"),
     "a copy": (Rigged, COPIES.format(r"mocap_pos\[0\]")),
     "a copy on joints": (OnJoints, COPIES.format(r"qpos\[2\]")),
+    "a filtered copy": (lambda: Noted(Filtered()), COPIES.format(r"userdata\[0\]")),
     "a noted copy": (lambda: Noted(InUserdata()), COPIES.format(r"userdata\[0\]")),
 }
 

@@ -74,6 +74,27 @@ class Leashed(Home):
         return bool(np.linalg.norm(self.data.qpos - self.home) > 2.9)
 
 
+class Fading(Home):
+    """Its motors are the weaker the farther from the goal a place was that stands in its code."""
+
+    def begin(self, place):
+        self.far = float(np.linalg.norm(place - GOAL))
+
+    def control(self, action):
+        super().control(np.asarray(action) * min(1.0, self.far / 4))
+
+
+class Late(Puck):
+    """Its motors are weaker at the end by something that a reset computes of its place."""
+
+    def begin(self, place):
+        self.share = abs(float(np.cos(3 * place[0]) * place[1]))
+
+    def control(self, action):
+        late = self.data.time > 14.5
+        super().control(np.asarray(action) * (self.share if late else 1.0))
+
+
 class Speeding(Home):
     """Ends where it has moved by more than it could in a sample, from where the reset led to."""
 
@@ -324,6 +345,8 @@ STAYS = {
     "a fence": (Fence, SEED, r"home\)"),
     "a fence in a box": (Fence, SEED | {"starts": "reset"}, r"home\)"),
     "a fence at one place": (FenceAtOnePlace, {}, r"home\)"),
+    "numbers in its code": (Fading, {}, r"far\)"),
+    "what matters late": (Late, {"steps": 200}, ".*share"),
     "a leash": (Leashed, {"steps": None}, r"home\)"),
     "the place before": (Speeding, {"steps": None}, r"before\)"),
     "a radius": (FenceByDistance, SEED, r"most\)"),

@@ -9,6 +9,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+import torch
 from environments import (
     GOAL,
     STARTS,
@@ -64,7 +65,13 @@ class Telling(Flat):
             "x": float(place[0]),
             "side": "left" if place[1] > 0 else "right",
             "bodies": [{"name": "puck", "at": place}],
+            "cells": {(int(5 * place[0]), 0): None},
+            "parts": ("puck", complex(*place)),
+            "tensors": [torch.tensor(place)],
+            "ahead": True,
         }
+        if place[0] < -1.2:
+            del told["ahead"]
         return *found, info | {name: told[name] for name in told if name == self.tells}
 
     def keep(self, place):
@@ -140,7 +147,15 @@ REFUSED = {
     "the last info": (lambda: ByLastInfo(telling("x")), PAST.format("info x")),
     "a word": (by("side", lambda env, *rest: rest[-1]["side"] == "left"), PAST.format("info side")),
     "an entry of a list": (
-        by("bodies", lambda env, *rest: rest[-1]["bodies"][0]["at"]), HELD.format(r"info bodies\.0\.at"),
+        by("bodies", lambda env, *rest: rest[-1]["bodies"][0]["at"]), HELD.format("info bodies"),
+    ),
+    "keys": (
+        by("cells", lambda env, *rest: next(iter(rest[-1]["cells"]))[0] / 5), HELD.format("info cells"),
+    ),
+    "complex": (by("parts", lambda env, *rest: rest[-1]["parts"][1].real), HELD.format("info parts")),
+    "tensors": (by("tensors", lambda env, *rest: rest[-1]["tensors"][0]), HELD.format("info tensors")),
+    "an entry that is missing": (
+        by("ahead", lambda env, *rest: "ahead" in rest[-1]), HELD.format("info ahead"),
     ),
     "an attribute": (by("pose", lambda env, *_: env.unwrapped.pose), PAST.format("attribute pose")),
     "a truth": (by("above", lambda env, *_: env.unwrapped.above), PAST.format("attribute above")),

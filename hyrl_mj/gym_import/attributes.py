@@ -1,20 +1,29 @@
-"""Numbers and words that an environment holds in `info` and attributes: found by name, and set."""
+"""Values that an environment holds in `info` and attributes: found by name, and set."""
 
 from __future__ import annotations
 
 import copyreg
+import pickle
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Set
 from contextlib import suppress
+from numbers import Number
+from types import BuiltinFunctionType
 from typing import Any
 
 import numpy as np
 
-from hyrl_mj.gym_import.fingerprint import DEEPEST, FUNCTIONS, has_no_memory
+from hyrl_mj.gym_import.fingerprint import (
+    DEEPEST,
+    FUNCTIONS,
+    GENERATORS,
+    has_no_memory,
+    is_of_torch,
+)
 
 
 def held(inner: Any, info: dict[str, Any]) -> Iterator[tuple[str, Any, Any]]:
-    """Yields name, owner and key of numbers and words in `info` and in attributes, also within objects.
+    """Yields name, owner and key of values in `info` and in attributes, also within objects.
 
     What an owner holds, `value_at` gives.
     """
@@ -32,7 +41,7 @@ def _within(owner: Any, path: str, seen: set[int], depth: int) -> Iterator[tuple
     else:
         parts = [(name, getattr(owner, name)) for name in _slots(owner) if hasattr(owner, name)]
     for key, value in parts:
-        if isinstance(value, str) or numbers_of(value) is not None:
+        if taken_apart(value) is not None:
             yield f"{path}{key}", owner, key
         elif depth < DEEPEST and id(value) not in seen:
             seen.add(id(value))
@@ -65,18 +74,49 @@ def put_at(owner: Any, key: Any, value: Any) -> None:
             setattr(owner, key, value)
 
 
-def numbers_of(value: Any) -> np.ndarray | None:
-    """Returns the numbers (k,) that a value is, or all parts of a collection are; None if it holds others."""
-    if isinstance(value, dict):
-        value = [*value.values()]
-    if isinstance(value, list | tuple | deque):
-        parts = [numbers_of(part) for part in value]
-        numbers = [part for part in parts if part is not None]
-        return np.concatenate(numbers) if 0 < len(numbers) == len(parts) else None
-    if not isinstance(value, int | float | np.generic | np.ndarray):
+def taken_apart(value: Any) -> tuple[np.ndarray, Any] | None:
+    """Returns the numbers (k,) that a value holds, and what is left of it, to compare it.
+
+    None of what holds an object with attributes, a function, or something that cannot be written down.
+    """
+    numbers = list[np.ndarray]()
+    try:
+        rest = _rest(value, numbers)
+    except Exception:  # whatever a foreign class raises
         return None
-    array = np.asarray(value)
-    return array.ravel().astype(float) if array.dtype.kind in "biuf" else None
+    return np.concatenate([np.empty(0), *numbers]), rest
+
+
+def _rest(value: Any, numbers: list[np.ndarray]) -> Any:
+    """Returns what is left of a value without its numbers, which are added to a list of arrays (k,)."""
+    if is_of_torch(value, "Tensor"):
+        value = value.detach().cpu().numpy()
+    if isinstance(value, Number) and not isinstance(value, complex | np.generic):
+        value = np.array(float(value))  # type: ignore[arg-type]
+    if isinstance(value, complex | np.generic | np.ndarray):
+        array = np.asarray(value)
+        if array.dtype.kind in "biufc":
+            is_complex = array.dtype.kind == "c"
+            flat = np.stack([array.real, array.imag], axis=-1) if is_complex else array
+            numbers.append(flat.ravel().astype(float))
+            return array.shape
+        return [array.shape, _rest(array.ravel().tolist(), numbers)]
+    if isinstance(value, dict):
+        return [(_rest([key], []), key, _rest(part, numbers)) for key, part in value.items()]
+    if isinstance(value, list | tuple | deque):
+        return [_rest(part, numbers) for part in value]
+    if isinstance(value, Set):
+        return [frozenset(value), _rest([*value], [])]
+    has_more = isinstance(value, (FUNCTIONS, BuiltinFunctionType, *GENERATORS)) or _slots(value)
+    if has_more or hasattr(value, "__dict__") or has_no_memory(value):
+        raise TypeError("it is more than a value")
+    return value if isinstance(value, str | bytes | None) else pickle.dumps(value)
+
+
+def numbers_of(value: Any) -> np.ndarray | None:
+    """Returns the numbers (k,) that a value holds; None if it holds none, or is more than a value."""
+    parts = taken_apart(value)
+    return parts[0] if parts is not None and len(parts[0]) else None
 
 
 def numbers_in(inner: Any) -> dict[str, np.ndarray]:
@@ -89,7 +129,7 @@ def set_numbers(inner: Any, values: Mapping[str, np.ndarray]) -> None:
     for name, owner, key, numbers in [*_numbers(inner)]:
         if name in values:
             old, new = value_at(owner, key), np.where(np.isnan(values[name]), numbers, values[name])
-            if isinstance(old, np.ndarray) and old.flags.writeable:
+            if isinstance(old, np.ndarray) and old.flags.writeable and old.dtype.kind in "biuf":
                 old[...] = new.reshape(old.shape)  # it may be known by several names
             else:
                 put_at(owner, key, like(old, new))
@@ -110,11 +150,22 @@ def like(old: Any, numbers: Iterable[Any]) -> Any:
         return type(old)(*(like(part, numbers) for part in old))
     if isinstance(old, list | tuple | deque):
         return type(old)(like(part, numbers) for part in old)
+    if is_of_torch(old, "Tensor"):
+        return old.new_tensor(like(old.detach().cpu().numpy(), numbers))
     if isinstance(old, np.ndarray):
-        values = np.array([next(numbers) for _ in range(old.size)]).reshape(old.shape)
+        if old.dtype.kind not in "biufc":
+            found = old.copy()
+            found.ravel()[:] = like(old.ravel().tolist(), numbers)
+            return found
+        values = np.array([like(one, numbers) for one in old.ravel().tolist()]).reshape(old.shape)
         return values if _are_parts(values, old.dtype) else values.astype(old.dtype)
-    number = next(numbers)
-    return number if _are_parts(number, type(old)) else type(old)(number)
+    if isinstance(old, complex | np.complexfloating):
+        return type(old)(complex(next(numbers), next(numbers)))
+    if not isinstance(old, Number):
+        return old
+    number: Any = next(numbers)
+    kind: Any = type(old)
+    return number if _are_parts(number, kind) else kind(number)
 
 
 def _are_parts(numbers: Any, kind: Any) -> bool:

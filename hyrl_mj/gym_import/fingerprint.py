@@ -152,7 +152,7 @@ def state_of(generator: Any) -> bytes:
         return os.urandom(16)  # the system's, which nothing tells: it never is as it was
     if isinstance(generator, random.Random):
         return pickle.dumps(generator.getstate())
-    if _is_of_torch(generator, "Generator"):
+    if is_of_torch(generator, "Generator"):
         return bytes(generator.get_state().numpy())
     bits = getattr(generator, "bit_generator", generator)
     return pickle.dumps(bits.state if hasattr(bits, "state") else generator.get_state())
@@ -164,7 +164,7 @@ def _walk(value: Any, path: str, found: Fingerprint, seen: set[int], depth: int)
         found[path] = marshal.dumps(value, 0)  # NaN equals NaN so
     elif isinstance(value, np.ndarray | np.generic) and value.dtype.kind in "biufcSU":
         found[path] = value.shape, value.dtype.str, value.tobytes()
-    elif isinstance(value, GENERATORS) or _is_of_torch(value, "Generator"):
+    elif isinstance(value, GENERATORS) or is_of_torch(value, "Generator"):
         found[path], found.generators[path] = state_of(value), value
     elif isinstance(value, spaces.Space):
         parts: Any = getattr(value, "spaces", ())  # of a Dict or a Tuple
@@ -213,7 +213,7 @@ def _parts(value: Any, path: str, found: Fingerprint, depth: int) -> dict[str, A
         return {f"{path}.self": value.__self__}
     if isinstance(value, partial):
         return {f"{path}()": [value.func, value.args, value.keywords]}
-    if _is_of_torch(value, "Tensor"):
+    if is_of_torch(value, "Tensor"):
         return {path: value.detach().cpu().numpy()}
     if not hasattr(value, "__dict__"):
         try:
@@ -244,7 +244,8 @@ def _has_more(kind: type) -> bool:
     return kind.__basicsize__ > object.__basicsize__ + 8 * (pointers + slots)
 
 
-def _is_of_torch(value: Any, name: str) -> bool:
+def is_of_torch(value: Any, name: str) -> bool:
+    """Returns whether a value is of a class of torch, which need not be installed."""
     torch = sys.modules.get("torch")
     return torch is not None and isinstance(value, getattr(torch, name))
 
@@ -312,5 +313,5 @@ def _data_of(owner: Any, size: int) -> list[str]:
         name
         for name, value in vars(owner).items()
         if not name.startswith("__")
-        and (isinstance(value, DATA) or _is_of_torch(value, "Generator"))
+        and (isinstance(value, DATA) or is_of_torch(value, "Generator"))
     ]

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable, Iterator, Sequence
+from dis import get_instructions
 from functools import partial
 from itertools import chain
+from types import FunctionType
 from typing import Any
 
 import mujoco
@@ -27,7 +29,7 @@ from hyrl_mj.gym_import.attributes import (
     value_at,
 )
 from hyrl_mj.gym_import.coordinates import own_of
-from hyrl_mj.gym_import.fingerprint import differing, shared_variables
+from hyrl_mj.gym_import.fingerprint import LIBRARIES, differing, shared_variables
 from hyrl_mj.gym_import.instance import Instance, Seen, renewed, to_end
 from hyrl_mj.gym_import.resets import (
     OF_MODEL,
@@ -45,6 +47,8 @@ from hyrl_mj.gym_import.trials import EPISODES, HELD, SAMPLES
 
 # Samples of a run from the start of a reset, which is compared with one that is put there.
 NATURAL = 100
+# Samples that such runs take together before they are cut off there.
+LONG = 1_000
 # Lines of Python that a reset may take in a trial: one that draws until something holds may never end.
 LINES = 100_000
 # By how much equality constraints and limits of tendons may be violated more than after resets [m, rad].
@@ -165,7 +169,7 @@ def _check_following(spec: EnvironmentSpec, resets: Resets) -> None:
         tries = [(ours, moved, values, [*follow, *names])]
         for sign in (1, -1) if follow and i < EPISODES // 2 else ():
             away = {name: values[name] + sign * far[name] for name in follow}
-            tries.append((ours[:NATURAL], state, away, [*follow]))
+            tries.append((ours[: NATURAL if i else None], state, away, [*follow]))
         for seen, start, noted, what in tries:
             other = renewed(other)
             other.noted = partial(_set, other, noted)
@@ -359,11 +363,11 @@ def _check_natural(spec: EnvironmentSpec, resets: Resets) -> None:
 
     The robot is put there as that reset left it, and all else is as the reset left it that runs begin with.
     """
-    usual, rng = Instance(spec), np.random.default_rng(12)
+    usual, rng, taken = Instance(spec), np.random.default_rng(12), 0
     own = np.append(own_of(usual), usual.physics.columns["warmstart"])
-    n = min(NATURAL, spec.max_steps)
-    none = np.zeros((n + 1, spec.dimension))
     for natural in _naturals(spec, resets):
+        n = spec.max_steps if taken < LONG else min(NATURAL, spec.max_steps)
+        none, taken = np.zeros((n + 1, spec.dimension)), taken + n
         state = spec.state.copy()
         state[own] = natural.physics.read()[own]
         if natural.physics.depth(spec.solid) > spec.depth:
@@ -397,7 +401,9 @@ def _naturals(spec: EnvironmentSpec, resets: Resets) -> Iterator[Instance]:
             by = state[places] - spec.state[places]
             if not _resets_moved(probe, name, by):
                 continue
-            if not np.allclose(probe.physics.read()[places], state[places], rtol=SAME, atol=SAME):
+            now = probe.physics.read()[places]
+            there, stays = (np.isclose(now, one[places], SAME, SAME) for one in (state, spec.state))
+            if not (there | stays).all() or stays.all():
                 break  # it leads to no other places
             natural = Instance(spec)
             _resets_moved(natural, name, by)
@@ -408,16 +414,56 @@ def _homes(instance: Instance) -> dict[str, tuple[Any, Any, list[int]]]:
     """Returns numbers that may be the place to which resets lead: owners, keys, and where the chart's are.
 
     They are as many as positions, of the chart at least, in attributes, in variables that instances share,
-    or in keyframes.
+    or in keyframes. Numbers in the code of a method are those of the chart's place that stand there once.
     """
-    at, nq = [c.index for c in instance.spec.coordinates if c.kind == "qpos"], instance.model.nq
+    spec = instance.spec
+    at, nq = [c.index for c in spec.coordinates if c.kind == "qpos"], instance.model.nq
     found = dict[str, tuple[Any, Any, list[int]]]()
     for name, owner, key in (*held(instance.inner, {}), *shared_variables(instance.env)):
         numbers = numbers_of(value_at(owner, key))
         if numbers is not None and len(at) <= len(numbers) <= nq:
             found[name] = owner, key, at if len(numbers) == nq else [*range(len(at))]
+    place = spec.state[spec.places[[c.kind == "qpos" for c in spec.coordinates]]]
+    for kind in type(instance.inner).__mro__:
+        own = kind.__module__.partition(".")[0] not in LIBRARIES
+        for name, method in vars(kind).items() if own else ():
+            if isinstance(method, FunctionType) and (code := _Constants(method, place)).found.any():
+                found[f"numbers in {name}()"] = code, "numbers", [*range(len(at))]
     keys = [nq * row + i for row in range(instance.model.nkey) for i in at]
     return {**found, "key_qpos": (instance.model, "key_qpos", keys)} if keys else found
+
+
+class _Constants:
+    """The numbers (d,) of a place that the code of a function holds, which can be set as others.
+
+    Attributes:
+        found: (d,) bool, those that it holds once, and are no zeros.
+    """
+
+    def __init__(self, function: FunctionType, place: np.ndarray):
+        self._function, self._code, self._place = function, function.__code__, place
+        loaded = [one.argval for one in get_instructions(function) if one.opname == "LOAD_CONST"]
+        flat = [x for one in loaded for x in (one if isinstance(one, tuple) else (one,))]
+        numbers = [x for x in flat if type(x) in (int, float)]
+        self.found = np.array([numbers.count(x) == 1 and x != 0 for x in place.tolist()])
+
+    @property
+    def numbers(self) -> list[float]:
+        return [float(x) for x in self._place]
+
+    @numbers.setter
+    def numbers(self, numbers: list[float]) -> None:
+        known = zip(self._place[self.found].tolist(), np.array(numbers)[self.found], strict=True)
+        new = {x: float(y) for x, y in known}
+
+        def moved(one: Any) -> Any:
+            if isinstance(one, tuple):
+                return tuple(map(moved, one))
+            return new.get(one, one) if type(one) in (int, float) else one
+
+        moves = numbers != self.numbers
+        consts = tuple(map(moved, self._code.co_consts)) if moves else self._code.co_consts
+        self._function.__code__ = self._code.replace(co_consts=consts)
 
 
 def _resets_moved(instance: Instance, name: str, by: np.ndarray) -> bool:

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.gym_import.attributes import held, numbers_of, put_at, value_at
+from hyrl_mj.gym_import.attributes import held, put_at, taken_apart, value_at
 from hyrl_mj.gym_import.coordinates import own_of
 from hyrl_mj.gym_import.instance import Instance, Seen, renewed, to_end
 from hyrl_mj.gym_import.observations import flat
@@ -32,6 +32,7 @@ TOLD, SELDOM = 3, 200
 # What an environment tells beside its observation, by name, among which the reward has one of its own.
 Told = dict[str, Any]
 REWARD = "the reward"
+GONE = type("Gone", (), {})  # in place of what is not told
 
 
 class _Sensor:
@@ -136,7 +137,8 @@ def check_copied(spec: EnvironmentSpec) -> None:
     """Raises `BadInput` if what is observed shows the place by what code copies into MuJoCo's state.
 
     A copy, as of a camera that is put above the robot, is moved by as much as the robot, whatever it was
-    before. Noise on the chart does not reach it.
+    before. What follows the place in `userdata`, where no physics writes, is one, too, also
+    scaled or filtered. Noise on the chart does not reach it.
     """
     rng, one, step = np.random.default_rng(15), Instance(spec), spec.nudge
     columns, far = one.physics.columns, float(step.max())
@@ -157,7 +159,9 @@ def check_copied(spec: EnvironmentSpec) -> None:
         here, there, after = (run[-1].state for run in runs)
         by = np.append(step, (there - here)[spec.places])
         moved = np.abs((there - here)[others, None] - by[by != 0]) <= SAME * far
-        copies = others[moved.any(axis=1) & (np.abs(after - here)[others] <= SAME * far)]
+        is_copy = moved.any(axis=1) & (np.abs(after - here)[others] <= SAME * far)
+        noted = np.isin(others, columns["userdata"]) & (there != here)[others]
+        copies = others[is_copy | noted]
         if not len(copies):
             continue
         other, one = here.copy(), renewed(one)
@@ -206,7 +210,11 @@ def check_told(spec: EnvironmentSpec) -> None:
         here = _run(usual, state, inputs, none)
         there = _run(other, elsewhere, inputs[: TOLD - 1], none[:TOLD])
         follow = [
-            {n: b[n] for n in a if n in b and _differs(a[n], b[n], None if i % 4 else least)}
+            {
+                n: b.get(n, GONE)
+                for n in {**a, **b}
+                if _differs(a.get(n, GONE), b.get(n, GONE), None if i % 4 else least)
+            }
             for (_, a), (_, b) in zip(here, there, strict=False)
         ]
         if not any(follow):
@@ -309,9 +317,15 @@ def _run(
         *ends, info = *rest[:-1], dict(rest[-1])  # nothing but the info of a reset
         places = [*held(instance.inner, info)]
         told.append({name: copy.deepcopy(value_at(owner, key)) for name, owner, key in places})
-        for name, owner, key in places:
-            if name in new:
+        known = {name: (owner, key) for name, owner, key in places}
+        top = {"info": info, "attribute": getattr(instance.inner, "__dict__", {})}
+        for name in new.keys() - {REWARD}:
+            kind, _, word = name.partition(" ")
+            owner, key = known.get(name, (top[kind], word))
+            if new[name] is not GONE:
                 put_at(owner, key, copy.deepcopy(new[name]))
+            elif isinstance(owner, dict):
+                owner.pop(key, None)
         if ends:
             told[-1][REWARD] = ends[0]
             ends[0] = new.get(REWARD, ends[0])
@@ -328,14 +342,12 @@ def _differs(here: Any, there: Any, least: float | None) -> bool:
 
     Args:
         here, there: what is told.
-        least: by how much numbers differ that follow it; None where the places are far apart, and only words,
-            truths and whole numbers tell them apart.
+        least: by how much numbers differ that follow it; None where places are far apart, and only truths,
+            whole numbers, and what are no numbers tell them apart.
     """
-    if isinstance(here, str):
-        return least is None and bool(here != there)
-    a, b = numbers_of(here), numbers_of(there)
-    if a is None or b is None or len(a) != len(b):
-        return False
+    (a, word), (b, other) = (taken_apart(told) or (np.empty(0), told) for told in (here, there))
+    if len(a) != len(b) or word != other:
+        return True
     if least is not None:
         return bool(np.abs(a - b).max(initial=0.0) >= least)
     return not np.array_equal(a, b) and all(np.array_equal(x, np.rint(x)) for x in (a, b))

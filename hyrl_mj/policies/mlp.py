@@ -130,7 +130,10 @@ class MlpPolicy(ObservationPolicy):
         needed = (self.frames * k, outputs)
         if sizes != needed:
             stacked = sizes[1] == outputs and sizes[0] > k and sizes[0] % k == 0
-            hint = f": give --n-stack {sizes[0] // k} if it saw as many at once" if stacked else ""
+            hint = (
+                f": give --n-stack {sizes[0] // k} if VecFrameStack showed it as many at once; a "
+                "FrameStackObservation belongs into the environment"
+            ) * stacked
             raise BadArtifact(
                 f"the network takes {sizes[0]} and gives {sizes[1]} numbers, "
                 f"the task {task.name} needs {needed[0]} and {needed[1]}{hint}"

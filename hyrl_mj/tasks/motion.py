@@ -70,13 +70,13 @@ def begins_anew(task: Task, of_chart: bool = False) -> bool:
 
 
 def ends_well(task: Task) -> bool:
-    """Returns whether episodes end as a success somewhere on the chart, or up to a tenth of it beyond.
+    """Returns whether episodes end as a success somewhere on the chart, or up to ten times its sides beyond.
 
     Where they do may be small: it is looked for nearer and nearer to where the task's `miss` is least, too.
     """
     rng, chart = np.random.default_rng(0), task.chart
-    beyond = np.where(chart.periodic, 0.0, chart.sides / 10)
-    for by in (0.0, beyond):
+    for share in (0.0, 0.1, 1.0, 10.0):
+        by = np.where(chart.periodic, 0.0, share * chart.sides)
         low, high = chart.origin - by, chart.origin + chart.sides + by
         z = rng.uniform(low, high, (STATES, chart.dimension))
         for share in (*NEARER, 0.0):
