@@ -15,6 +15,7 @@ from importlib.machinery import (
     SourcelessFileLoader,
     all_suffixes,
 )
+from itertools import product
 from pathlib import Path
 from types import CodeType
 
@@ -42,16 +43,19 @@ def sources(path: Path) -> list[Path]:
     found = dict.fromkeys([path, *parts])
     # Among installed packages everything lies beside everything.
     left = [] if root.name in _INSTALLED else [*found]
+    looked: set[tuple[Path, str]] = set()
     while left:
         file = left.pop()
-        for name in _imported(file.read_bytes()) if file.suffix == ".py" else ():
-            for folder in {root, path.parent, file.parent}:
-                # Compiled modules, too: Python takes them before those of the same name.
-                files = [folder / f"{name}{suffix}" for suffix in all_suffixes()]
-                files += modules_in(folder / name)
-                new = [f for f in files if f.is_file() and f not in found]
-                found |= dict.fromkeys(new)
-                left += new
+        names = _imported(file.read_bytes()) if file.suffix == ".py" else ()
+        places = {*product({root, path.parent, file.parent}, names)} - looked
+        looked |= places
+        for folder, name in places:
+            # Compiled modules, too: Python takes them before those of the same name.
+            files = [folder / f"{name}{suffix}" for suffix in all_suffixes()]
+            files += modules_in(folder / name)
+            new = [f for f in files if f.is_file() and f not in found]
+            found |= dict.fromkeys(new)
+            left += new
     del found[path]
     return [path, *sorted(found)]  # sets are in another order in another process
 

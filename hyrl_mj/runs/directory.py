@@ -249,7 +249,12 @@ class Run:
     @cached_property
     def robustness(self) -> Robustness:
         """The result of the examination under noise, from `robustness.json`."""
-        return Robustness.load(self._checked("robustness.json"), of=("policy", "hyrl"))
+        path = self._checked("robustness.json")
+        found = Robustness.load(path, of=("policy", "hyrl"))
+        lost = [one.first for one in (found.game.replays if found.game else ()) if one.first]
+        if any(len(first.start) != self.task.chart.dimension for first in lost):
+            raise BadArtifact(f"{path} has a start in another chart than that of {self.task.name}")
+        return found
 
     @cached_property
     def arrivals(self) -> Arrivals:
