@@ -287,7 +287,7 @@ def shorten() -> None:
     planted.few_trials(patch)
     patch.setattr(steps, "SPARING", replace(steps.SPARING, **EFFORT))
     patch.setattr(counterexamples, "MOST_CELLS", 2)
-    patch.setattr(counterexamples, "_beaten", few_of(counterexamples._beaten))
+    patch.setattr(counterexamples, "beaten", few_of(counterexamples.beaten))
     patch.setattr(episodes, "JUDGED", 4)
     for dimension, few in ((1, 130), (2, 60)):
         patch.setitem(resolution.CURVE_CELLS, dimension, few)

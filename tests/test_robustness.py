@@ -34,6 +34,8 @@ from hyrl_mj.judging.game.solver import NEVER
 from hyrl_mj.judging.worst_case import worst_case
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.sets import Grid
+from hyrl_mj.simulation import closed_loop
+from hyrl_mj.tasks import Outcome
 
 WON, WON_FROM_SOME, UNCLEAR, BEATEN, UNWINNABLE, OVER = MapClass
 
@@ -253,6 +255,28 @@ def test_the_map_s_classes_are_those_of_the_starts(vehicle, on_vehicle):
     assert classes("sign", points) == [WON, BEATEN, WON, UNWINNABLE, OVER]
     assert classes("ideal", points) == [WON, WON, WON_FROM_SOME, UNWINNABLE, OVER]
     np.testing.assert_array_equal(game.map("sign", 0.1) == OVER, ~game.lattice.running)
+
+
+def test_where_samples_end_between_nodes_a_map_calls_lost_what_is_lost_on_the_plant(circle):
+    """A slow policy goes half a cell in a sample: by rounding, the adversary of the game can hold it."""
+    quick = circle_policy(circle)
+    controllers = {
+        "quick": PolicyController(quick),
+        "slow": PolicyController(ChartPolicy(circle, lambda z: 0.45 * quick.act(z))),
+    }
+    game = Game(circle, halves(circle), controllers, 0.1, grid=Grid.with_cells(circle.chart, 150))
+    assert not game.lattice.exact
+    certificate = SimpleNamespace(game=game, answers={}, cells=None, controllers=controllers)
+    lost = {}
+    for name, loop in controllers.items():
+        of_game = game.map(name, 0.1) == BEATEN
+        lost[name] = examination._map(certificate, name, 0.1) == BEATEN
+        starts = game.lattice.grid.nodes[of_game]
+        run = closed_loop(circle, loop, starts, game.worst_noise(name, 0.1))
+        np.testing.assert_array_equal(lost[name][of_game], run.outcome != Outcome.REACHED)
+        assert not lost[name][~of_game].any()
+    assert lost["quick"].any()
+    assert (game.map("slow", 0.1) == BEATEN).sum() > lost["slow"].sum()
 
 
 # ---- worst signals

@@ -649,7 +649,11 @@ HEIGHT = (
     ("own", "height", "outcome"),
     [
         ({}, "", "stalled"),
-        ({"ending": "ends = np.where(measured[:, 0] > 5.0, int(Outcome.REACHED), 0)"}, "", "stalled"),
+        (
+            {"ending": "ends = np.where(measured[:, 0] > 5.0, int(Outcome.REACHED), 0)"},
+            "",
+            "stalled",
+        ),
         ({"ending": "ends = np.zeros(len(measured), int)"}, "", "reached"),
         (LIFTED, HEIGHT, "stalled"),
     ],

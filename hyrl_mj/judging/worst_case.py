@@ -32,12 +32,12 @@ from hyrl_mj.judging.game import (
 )
 from hyrl_mj.judging.proof.cells import why_no_cells
 from hyrl_mj.judging.proof.certificate import Certificate, Proved
-from hyrl_mj.judging.proof.counterexamples import Broken, find_counterexamples
+from hyrl_mj.judging.proof.counterexamples import Broken, beaten, find_counterexamples
 from hyrl_mj.judging.proof.replays import replay
 from hyrl_mj.judging.proof.sensed import prove_under
 from hyrl_mj.policies import BLAS, Controller
 from hyrl_mj.sets import GridSet
-from hyrl_mj.simulation import LoopSettings, Sensor, closed_loop, covers_sensor
+from hyrl_mj.simulation import NOT_STARTED, LoopSettings, Sensor, closed_loop, covers_sensor
 from hyrl_mj.system import cores
 from hyrl_mj.system.progress import progress_bar
 from hyrl_mj.tasks import Task
@@ -163,8 +163,18 @@ def _score(certificate: Certificate, name: str, nodes: NodeScore, broken: Broken
 
 
 def _map(certificate: Certificate, name: str, eps: float) -> np.ndarray:
-    """Returns the class (N,) of every node; what is won counts as proved if all cells around it are."""
-    classes = certificate.game.map(name, eps)
+    """Returns the class (N,) of every node; what is won counts as proved if all cells around it are.
+
+    Where samples end between nodes the game calls a node lost too often: there it has to lose on the plant.
+    """
+    game = certificate.game
+    classes = game.map(name, eps)
+    lost = classes == MapClass.BEATEN
+    if lost.any() and not (game.lattice.exact or game.lattice.estimate):
+        starts, noise = game.lattice.grid.nodes[lost], game.worst_noise(name, eps)
+        modes = np.full(len(starts), NOT_STARTED)
+        plays = beaten(game, certificate.controllers[name], starts, modes, noise)
+        classes[lost] = np.where(plays, MapClass.BEATEN, MapClass.UNCLEAR)
     won = np.isin(classes, (MapClass.WON, MapClass.WON_FROM_SOME))
     some = every = np.zeros_like(won)
     if name in certificate.answers and certificate.cells is not None:

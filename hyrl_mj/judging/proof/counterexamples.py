@@ -74,7 +74,7 @@ def find_counterexamples(certificate: Certificate, name: str, eps: float) -> Bro
     for noise in noises:
         row, at = np.nonzero(attacked & ~nodes)
         starts = game.lattice.grid.nodes[at]
-        nodes[row, at] = _beaten(game, controller, starts, modes[row], noise)
+        nodes[row, at] = beaten(game, controller, starts, modes[row], noise)
     if cells is None:
         return Broken(nodes[-1], np.asarray(nodes.any(axis=0)), tried)
     broken = np.stack([cells.some_corner(row) for row in nodes])
@@ -84,7 +84,7 @@ def find_counterexamples(certificate: Certificate, name: str, eps: float) -> Bro
         chosen = [_inside(cells, np.flatnonzero(of_mode), rng) for of_mode in unclear]
         at, starts = (np.concatenate(parts) for parts in zip(*chosen, strict=True))
         row = np.repeat(np.arange(len(chosen)), [len(some) for some, _ in chosen])
-        broken[row, at] = _beaten(game, controller, starts, modes[row], inside)
+        broken[row, at] = beaten(game, controller, starts, modes[row], inside)
     all_cells = np.ones(cells.nodes, dtype=bool)
     return Broken(broken[-1], np.asarray(broken.any(axis=0)), all_cells)
 
@@ -104,7 +104,7 @@ def _inside(
     return at, cells.draw(at, rng)
 
 
-def _beaten(
+def beaten(
     game: Game, controller: Controller, starts: np.ndarray, modes: np.ndarray, noise: AnyNoise
 ) -> np.ndarray:
     """Returns from which starts (n, d), in modes (n,), the noise beats the controller: (n,) bool."""
