@@ -198,6 +198,16 @@ def test_a_model_of_another_file_is_judged_by_that(tmp_path):
     assert simulate(get_task(path), Steer(), [0.0, 0.5]).outcome == "reached"
 
 
+def test_a_model_that_no_file_holds_is_no_robot_of_a_run(tmp_path):
+    path = write(tmp_path)
+    xml = path.with_suffix(".xml")
+    own = f"    model = mujoco.MjModel.from_xml_string({xml.read_text()!r})\n"
+    path.write_text("import mujoco\n" + path.read_text() + own)
+    xml.unlink()
+    with pytest.raises(BadInput, match=r"there is no .*\.xml, by which a run knows its robot"):
+        check_task(get_task(path))
+
+
 def test_the_digest_of_a_task_is_the_same_in_each_process(tmp_path):
     names = [f"part_{i}" for i in range(8)]
     for name in names:

@@ -238,6 +238,11 @@ def _check_training(task: Task) -> None:
 
 def _check_model(task: Task) -> None:
     model, path = task.model, task.model_path
+    if task.source is not None and mjcf.origin(model) is None and not path.is_file():
+        raise BadInput(
+            f"there is no {path}, by which a run knows its robot: write the MJCF there, as "
+            "MjSpec.to_xml() gives it, or load a file by hyrl_mj.mjcf.load"
+        )
     if not model.nu:
         raise BadInput(f"{path.name} has no actuators: give the policy at least one to drive")
     low, high = task.input_limits

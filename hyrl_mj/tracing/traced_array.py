@@ -79,13 +79,14 @@ def apply(name: str, *operands: Any, **options: Any) -> Traced:
 class Traced(NDArrayOperatorsMixin):
     """An array that records the operations it results from.
 
-    In NumPy a part of an array, or the array in another shape, shares its memory. Here it does not: once one
-    of them was written to, the others cannot be used any more.
+    In NumPy a part of an array, or the array in another shape, shares its memory. Here such a part is taken
+    anew where the whole was written to; once a part was written to, the whole cannot be used any more.
     """
 
     def __init__(self, operation: Operation) -> None:
         self._operation = operation
-        self._whole: tuple[Traced, Operation] | None = None  # of which it is a part, as it was then
+        # Of which it is a part, as that was when it was taken, and what takes it.
+        self._whole: tuple[Traced, Operation, Callable[[], Traced]] | None = None
         self._written: Traced | None = None  # the part of it that was written to
         value = operation.value
         # Operations in place change none of these.
@@ -94,22 +95,22 @@ class Traced(NDArrayOperatorsMixin):
     @property
     def operation(self) -> Operation:
         """The last operation, whose result it is."""
-        part, changed = self, self._written is not None
-        while part._whole is not None:
-            whole, then = part._whole
-            other = whole._written is not None and whole._written is not part
-            changed |= other or whole._operation is not then
-            part = whole
-        if changed:
+        if self._written is not None:
             raise Untraceable(
-                "writes to an array of which a part has a name of its own: give that name to a copy"
+                "writes to a part of an array by a name of its own, and goes on with the array: write to the "
+                "array, as x[:, 0] -= 1"
             )
+        if self._whole is not None:
+            whole, then, again = self._whole
+            if whole._written is not self and whole.operation is not then:
+                self._operation = again().operation
+                self.part_of(whole, again)
         return self._operation
 
-    def part_of(self, whole: Traced) -> Traced:
-        """Returns itself, as what shares its memory with another array."""
+    def part_of(self, whole: Traced, again: Callable[[], Traced]) -> Traced:
+        """Returns itself, as what shares its memory with another array, of which it can be taken `again`."""
         if self is not whole:
-            self._whole = whole, whole._operation
+            self._whole = whole, whole._operation, again
         return self
 
     def __len__(self) -> int:
@@ -130,7 +131,7 @@ class Traced(NDArrayOperatorsMixin):
 
     def transpose(self, *axes: Any) -> Traced:
         order = np.empty(range(self.ndim)).transpose(*axes).shape
-        return apply("transpose", self, axes=order).part_of(self)
+        return apply("transpose", self, axes=order).part_of(self, lambda: self.transpose(*axes))
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):  # NumPy looks for its own protocols
@@ -195,7 +196,9 @@ class Traced(NDArrayOperatorsMixin):
                 picked = take(picked, indices if indices.ndim else int(indices), axis)
                 axis += indices.ndim - 1
             axis += 1
-        return picked if any(map(np.ndim, picking)) else picked.part_of(self)
+        if any(map(np.ndim, picking)):
+            return picked
+        return picked.part_of(self, lambda: self[index])
 
     def __setitem__(self, index: Any, value: Any) -> None:
         if value is self._written:  # as the second half of x[:, 0] -= 1
@@ -263,7 +266,11 @@ def _reshape(x: Any, shape: Any) -> Traced:
     shape = np.reshape(x.operation.value, shape).shape
     if BATCH not in shape:
         raise Untraceable("joins the rows of a batch: each must stand for itself")
-    return x if shape == x.shape else apply("reshape", x, shape=shape).part_of(x)
+    return (
+        x
+        if shape == x.shape
+        else apply("reshape", x, shape=shape).part_of(x, lambda: _reshape(x, shape))
+    )
 
 
 def take(x: Any, indices: Any, axis: int | None = None) -> Traced:
