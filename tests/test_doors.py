@@ -25,7 +25,7 @@ from hyrl_mj.errors import BadInput
 from hyrl_mj.fields import read_field
 from hyrl_mj.fields.driving import Driving
 from hyrl_mj.files import artifacts, trust
-from hyrl_mj.gym_import import from_gymnasium, making
+from hyrl_mj.gym_import import from_gymnasium, making, opening
 from hyrl_mj.gym_import.making import from_spec
 from hyrl_mj.physics import mjcf
 from hyrl_mj.policies import pickled
@@ -321,6 +321,21 @@ def test_a_module_that_the_user_names_comes_last(tmp_path, monkeypatch):
     assert trust.module_file("mujoco:X").parent.name == "mujoco"
     for name in ("", "__main__", "no_such_module"):
         assert trust.module_file(name) is None
+
+
+def test_an_environment_whose_class_lies_beside_its_registration_is_made_again(
+    tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    text = "import gymnasium\ngymnasium.register('Two-v0', 'two_class:Two')\n"
+    (tmp_path / "two_entry.py").write_text(text)
+    text = "from gymnasium.envs.mujoco.reacher_v5 import ReacherEnv as Two\n"
+    (tmp_path / "two_class.py").write_text(text)
+    before, description = [*sys.path], opening.Description("two_entry:Two-v0")
+    opening.preload(description)
+    sys.modules.pop("two_class", None)
+    assert type(opening.made(description).unwrapped).__name__ == "ReacherEnv"
+    assert sys.path == before
 
 
 # ---- fields

@@ -92,8 +92,11 @@ def _top(name: str) -> str:
 
 
 def _installed(name: str) -> ModuleSpec | None:
+    """Returns where a module is, if not in the current folder alone, from which it may have been imported."""
     with suppress(ValueError, ImportError):  # a name such as "" or "__main__"
-        return find_spec(_top(name))
+        spec, here = find_spec(_top(name)), PathFinder.find_spec(_top(name), [""])
+        if spec is None or here is None or here.origin is None or spec.origin != here.origin:
+            return spec
     return None
 
 

@@ -164,11 +164,11 @@ def preload(description: Description) -> None:
     make = description.env
     if not isinstance(make, str):
         return
-    with suppress(Exception, SystemExit):
+    own = ":" in make
+    with suppress(Exception, SystemExit), current_folder(make) if own else nullcontext():
         register(make)
-        if ":" in make:
-            with current_folder(make):
-                importlib.import_module(make.partition(":")[0])
+        if own:
+            importlib.import_module(make.partition(":")[0])
         entry = gym.spec(make.rpartition(":")[2]).entry_point
         if isinstance(entry, str):
             gym.envs.registration.load_env_creator(entry)
