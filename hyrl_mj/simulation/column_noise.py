@@ -64,10 +64,10 @@ class ColumnNoise:
     uniform: bool = False
     correlation: float = 0.0
     remarks: tuple[str, ...] = ()
-    times: np.ndarray = field(default_factory=lambda: np.empty(0))
-    errors: np.ndarray = field(default_factory=lambda: np.empty(0))
-    slow: np.ndarray = field(default_factory=lambda: np.empty(0))
-    correlations: np.ndarray = field(default_factory=lambda: np.empty(0))
+    times: np.ndarray = field(default_factory=lambda: np.empty(0), repr=False)
+    errors: np.ndarray = field(default_factory=lambda: np.empty(0), repr=False)
+    slow: np.ndarray = field(default_factory=lambda: np.empty(0), repr=False)
+    correlations: np.ndarray = field(default_factory=lambda: np.empty(0), repr=False)
 
     @property
     def text(self) -> str:
