@@ -198,7 +198,7 @@ def test_a_run_of_which_too_much_is_proved_says_so_everywhere(
     pipeline.run_stage(run, "report", print)
     page = (path / "report.html").read_text()
     assert "ithdrawn: a proved start was lost in a replay" in page
-    assert "replays in MuJoCo, noise on" in page
+    assert "replays in MuJoCo, noise of up to" in page
 
 
 # ---- plain MuJoCo as judge

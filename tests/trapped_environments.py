@@ -10,6 +10,7 @@ import sys
 from collections import Counter, defaultdict
 from dataclasses import replace
 from multiprocessing import get_context
+from threading import RLock
 from typing import Any
 
 import numpy as np
@@ -233,7 +234,9 @@ def main(argv):
     cases = [("trapped", i, seed) for i in range(n)] + [("honest", i, seed) for i in range(m)]
     verdicts, failures = [], 0
     # Each case in a process of its own, as it would be: what an environment leaves behind ends with it.
-    with get_context("fork").Pool(maxtasksperchild=1) as processes:
+    # One that is forked while this one draws its bar would wait for ever for the lock that this one holds.
+    own_lock = {"initializer": tqdm.set_lock, "initargs": (RLock(),)}
+    with get_context("fork").Pool(maxtasksperchild=1, **own_lock) as processes:
         for name, traps, verdict, why in tqdm(processes.imap(tried, cases), total=len(cases)):
             verdicts.append((traps, verdict))
             if is_failure(traps, verdict):
