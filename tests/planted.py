@@ -380,7 +380,7 @@ class Cube(Task):
         self.inputs = tuple(f"v{name}" for name in names)
         axes = ("1 0 0", "0 1 0", "0 0 1", "1 1 1", "1 -1 0", "0 1 -1")
         # An armature keeps the inertia of joints that are not independent regular.
-        inertia = "" if d < 5 else 'armature="1" '
+        inertia = "" if d < 4 else 'armature="1" '
         joint = '<joint name="{}" type="slide" ' + inertia + 'axis="{}"/>'
         velocity = '<velocity name="v{0}" joint="{0}" kv="1e9" ctrlrange="-1 1"/>'
         parts = {

@@ -399,7 +399,7 @@ def by_chance(observation):
 @pytest.mark.parametrize(
     ("policy", "options", "message"),
     [
-        (wrong_shape, {}, r"shape \(1280, 7\) for 1280"),
+        (wrong_shape, {}, r"shape \(16, 7\) for 16 observations"),
         (not_a_number, {}, "gives nan"),
         (by_chance, {}, "without chance or memory"),
         (3, {}, "cannot be called"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from hyrl_mj.viz.figures.charts import OUTER
 from hyrl_mj.viz.figures.shown import ShownRun
 from hyrl_mj.viz.tables import NAMED
 
+LETTERS = 40  # of a line above a panel of two
 CORE, GAP = 0.6, 0.05  # the inner radius of the innermost ring, and the gap between rings
 
 
@@ -69,7 +71,7 @@ def _draw_each(shown: ShownRun, shared: np.ndarray, title: str) -> Figure:
             charts.dots(panel, shown.critical.points)
             mode = sets.modes[i]
             name = f"{style.set_label(mode, extended=True)}, of mode {shown.task.mode_name(mode)}"
-            panel.set_title(name, color=mode_colour(i), fontweight="bold")
+            panel.set_title(fill(name, LETTERS), color=mode_colour(i), fontweight="bold")
         for panel in panels[len(sets.sets) :]:
             panel.set_axis_off()
         style.legend(figure)
