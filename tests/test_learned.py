@@ -95,6 +95,11 @@ def test_a_set_point_that_noise_hides_is_told_with_what_would_do(circle):
     for strict in (Strict(), Looking()):
         said = hidden_goal(strict, 0.1)
         assert re.search(r"hides up to 0\.1\d* of that, and 0\.15\d* with", said), said
-        assert re.search(r"a close of at least 0\.15, or noise of at most 0\.0\d", said), said
+        told = re.search(r"a close of at least (0\.1[56]), or noise of at most (0\.0\d+)$", said)
+        assert told, said
+        assert not hidden_goal(strict, float(told[2]))
+        strict.close = float(told[1])
+        assert not hidden_goal(strict, 0.1), "what is told would do"
+        strict.close = 0.12
         assert not hidden_goal(strict, 0.05)
     assert not hidden_goal(circle, 0.1)

@@ -142,10 +142,8 @@ def _write(controller: Exportable, folder: Path) -> tuple[Path, Path]:
     for name, array in arrays.items():
         digest.update(name.encode() + np.asarray(array).tobytes())
     export = digest.hexdigest()
-    text, arrays["export"] = (
-        text.replace('EXPORT = "name"', f'EXPORT = "{export}"'),
-        np.array(export),
-    )
+    text = text.replace('EXPORT = "name"', f'EXPORT = "{export}"')
+    arrays["export"] = np.array(export)
     path = folder / TEMPLATE.name
     path.write_text(text, encoding="utf-8")
     artifacts.write_arrays(path.with_suffix(".npz"), arrays, kind="controller")

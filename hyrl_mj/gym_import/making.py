@@ -38,9 +38,8 @@ _MADE: MutableMapping[str, EnvironmentTask] = WeakValueDictionary()
 _RECENT: deque[EnvironmentTask] = deque(maxlen=2)
 # Older tasks of functions of the same name.
 _OLDER: WeakSet[EnvironmentTask] = WeakSet()
-LARGEST = (
-    2**20
-)  # of a file of arguments [bytes], each of which is copied, compared and written down
+# Of a file of arguments [bytes], each of which is copied, compared and written down.
+LARGEST = 2**20
 
 
 def from_gymnasium(

@@ -132,13 +132,19 @@ def hidden_goal(task: Task, eps: float, everywhere: bool = False) -> str:
         return ""
     bounds = np.linspace(0, eps, 101)
     kept = [bound for bound in bounds if farthest(bound, 1) <= task.close]
-    less = f", or noise of at most {max(kept):.2g}" if kept else ""
+    less = f", or noise of at most {_rounded(max(kept), np.floor):g}" if kept else ""
     return (
         f"{task.name} has arrived up to {task.close:g} from its set-point (close), and noise of {eps:g} "
         f"alone hides up to {farthest(eps, 0):.3g} of that, and {farthest(eps, 1):.3g} with what it moves in "
         "one sample: there it may be lost whatever way it has gone. Give it a close of at least "
-        f"{farthest(eps, 1):.2g}{less}"
+        f"{_rounded(farthest(eps, 1), np.ceil):g}{less}"
     )
+
+
+def _rounded(x: float, way: np.ufunc) -> float:
+    """Returns a number > 0 with two digits, the next one above (np.ceil) or below (np.floor)."""
+    unit = 10.0 ** (np.floor(np.log10(x)) - 1) if x else 1.0
+    return float(way(x / unit) * unit)
 
 
 def _check_names(task: Task) -> None:

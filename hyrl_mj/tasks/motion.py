@@ -75,8 +75,8 @@ def ends_well(task: Task) -> bool:
     Where they do may be small: it is looked for nearer and nearer to where the task's `miss` is least, too.
     """
     rng, chart = np.random.default_rng(0), task.chart
-    for share in (0.0, 0.1, 1.0, 10.0):
-        by = np.where(chart.periodic, 0.0, share * chart.sides)
+    for beyond in (0.0, 0.1, 1.0, 10.0):
+        by = np.where(chart.periodic, 0.0, beyond * chart.sides)
         low, high = chart.origin - by, chart.origin + chart.sides + by
         z = rng.uniform(low, high, (STATES, chart.dimension))
         for share in (*NEARER, 0.0):
