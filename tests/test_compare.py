@@ -33,7 +33,8 @@ from hyrl_mj.runs.compared import Compared, Row
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import LoopSettings, closed_loop
 from hyrl_mj.tasks import Outcome
-from hyrl_mj.viz.compared_tables import ranked, result_table, sentences, tried_table
+from hyrl_mj.viz.compared_page import write_page
+from hyrl_mj.viz.compared_tables import print_compared, ranked, result_table, sentences, tried_table
 
 
 def raises(error):
@@ -534,6 +535,7 @@ def many(**more):
         (Row("held", "Held", -1),),
         (Row("held", "Held", 0, samples=10**400),),
         (Row("held", "Held", 0, figures={"worst": np.inf}),),
+        (Row("held", "Held", 0, figures={"worst": np.nan}),),
         (Row("held", "Held", 0, tried=dict.fromkeys(map(str, range(21)), 0.5)),),
     ],
 )
@@ -558,6 +560,16 @@ def test_a_damaged_comparison_is_refused(tmp_path):
 
 
 # ---- tables
+
+
+def test_where_nothing_fits_the_reasons_are_left(capsys, tmp_path):
+    unfit = Row("recurrent", "RecurrentPPO", 0, "unfit", "it lacks sb3-contrib")
+    found = Compared("unit_circle", 0.1, "fast", {}, True, (unfit,))
+    print_compared(found)
+    write_page(found, tmp_path)
+    told = "RecurrentPPO, seed 0: it lacks sb3-contrib."
+    assert told in capsys.readouterr().out
+    assert told in (tmp_path / "compare.html").read_text()
 
 
 def row(name, seed, worst, **more):

@@ -1,14 +1,22 @@
 """Tests of what a run tells before it rests on a policy, or on a task, that does not do what it should."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import hyrl_mj
 from hyrl_mj.errors import HyrlError
+from hyrl_mj.gym_export import BatchedEnv
 from hyrl_mj.judging import Arrivals, failures
-from hyrl_mj.pipeline import runs
+from hyrl_mj.learning import training
+from hyrl_mj.learning.to_go import NoWay, WayToGo
+from hyrl_mj.pipeline import RunOptions, runs
+from hyrl_mj.pipeline.runs import settings_of
+from hyrl_mj.pipeline.steps import run_stage
+from hyrl_mj.policies import MlpPolicy
+from hyrl_mj.runs.directory import opened
 from hyrl_mj.tasks import Outcome, hidden_goal, overlooked
 from hyrl_mj.tasks.scaffold import write_task
 from hyrl_mj.viz import figures
@@ -16,12 +24,12 @@ from hyrl_mj.viz import figures
 
 @pytest.mark.slow
 def test_a_run_stops_where_stage_1_has_not_learned_unless_told_to_go_on(tmp_path, monkeypatch):
-    short = {"stage1.samples": 4_096}
+    short = {"stage1.samples": 4_096, "stage1.attempts": 2}
     options = {"set": short, "out": tmp_path / "run", "say": lambda text: None}
     shown = tmp_path / "run" / "figures" / "arrivals.png"
     for _ in range(2):  # it is not trained twice
         with pytest.raises(
-            HyrlError, match=r"has not learned vehicle: its policy arrives from \d+ of 1,000"
+            HyrlError, match=r"has not learned vehicle in 2 trainings: its policy arrives from \d+ "
         ):
             hyrl_mj.run("vehicle", **options)
         assert shown.exists()
@@ -35,6 +43,73 @@ def test_a_run_stops_where_stage_1_has_not_learned_unless_told_to_go_on(tmp_path
     monkeypatch.setattr(runs, "run_stage", stage)
     hyrl_mj.run("vehicle", go_on=True, **options)
     assert after[0] == "critical-set"
+
+
+@pytest.mark.parametrize(("minutes", "trainings"), [(60, 2), (1e-9, 1)])
+def test_another_attempt_is_paid_for_the_way_to_the_goal_if_there_is_time(
+    minutes, trainings, tmp_path, monkeypatch
+):
+    """The first training gives a policy that never arrives, the second is what it is without training."""
+    train, given = training.train, []
+
+    def planted(task, settings, seed, **more):
+        given.append((settings.shaped, settings.samples, settings.rehearse, seed))
+        policy = train(task, replace(settings, samples=32), seed, **more)
+        weights = {name: 0 * w for name, w in policy.weights.items()}
+        return policy if len(given) > 1 else MlpPolicy(task, "ppo", policy.activation, weights)
+
+    def measured(task, policy):
+        return Arrivals(900 if any(w.any() for w in policy.weights.values()) else 0, 0, 1_000)
+
+    monkeypatch.setattr(training, "train", planted)
+    monkeypatch.setattr(Arrivals, "measure", measured)
+    said = []
+    options = RunOptions(
+        stage1_minutes=minutes, set={"stage1.envs": 8, "stage1.options.n_steps": 4}
+    )
+    settings = settings_of(hyrl_mj.get_task("gaps"), options)
+    with opened(tmp_path / "run", settings) as run:
+        found = run_stage(run, "train", said.append).arrivals
+    assert (found.trainings, found.arrived) == (trainings, 900 if trainings == 2 else 0)
+    first, *later = given
+    assert first == (False, settings.stage1.samples, 0.4, 0)
+    assert [attempt[:3] for attempt in later] == [(True, *first[1:3])] * (trainings - 1)
+    told = (
+        "which may take 1e-09: more"
+        if trainings == 1
+        else "arrives from 0 of 1,000 .* another training"
+    )
+    assert any(re.search(told, line) for line in said)
+
+
+def test_who_is_paid_for_the_way_to_the_goal_gets_more_beside_a_post_than_before_it():
+    gaps = hyrl_mj.get_task("gaps")
+    domain = WayToGo(gaps).domain(gaps.starts, gamma=0.9)
+    before, beside, beyond = np.array([[1.3, 0.0], [1.3, 0.5], [2.1, 0.0]])  # a post, and a gap
+    far, near, nearer = domain.reward(np.array([before, beside, beyond]))
+    assert 0 < far < near - 0.02 < nearer - 0.2
+    assert domain.reward(np.array([gaps.set_point])) == pytest.approx(1)
+    env = BatchedEnv(gaps, 3, domain=domain)
+    env.reset(z=np.array([before, beside, beyond]))
+    paid = env.step(np.zeros((3, 1)))
+    assert paid.reward == pytest.approx(domain.reward(env.z))
+    while not paid.terminated[0]:
+        paid = env.step(np.zeros((3, 1)))
+    assert paid.outcome[0] == Outcome.CRASHED
+    assert paid.reward[0] == 0 < paid.reward[1]
+
+
+def test_a_goal_that_no_way_leads_to_is_told():
+    class Walled(type(hyrl_mj.get_task("gaps"))):
+        def ending(self, measured):
+            ends = super().ending(measured)
+            ends[np.abs(measured[:, 0] - 2.2) < 0.1] = Outcome.CRASHED
+            return ends
+
+    with pytest.raises(
+        NoWay, match=r"no way leads from its starts to its goal on .* nodes of the chart"
+    ):
+        WayToGo(Walled())
 
 
 def test_how_episodes_fail_is_counted(vehicle):

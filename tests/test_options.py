@@ -24,7 +24,7 @@ def test_an_agent_has_the_options_of_a_run_but_those_of_its_training_and_four_of
         {f.name: (f.default, f.default_factory) for f in fields(kind)}
         for kind in (RunOptions, AgentOptions)
     )
-    assert {*of_runs} - {*of_agents} == {"algorithm", "go_on"}
+    assert {*of_runs} - {*of_agents} == {"algorithm", "go_on", "stage1_minutes"}
     assert {*of_agents} - {*of_runs} == {"activation", "stochastic", "vecnormalize", "n_stack"}
     for name in {*of_runs} & {*of_agents}:
         assert of_runs[name] == of_agents[name]

@@ -62,7 +62,10 @@ class Given:
     def samples(self) -> int:
         """The number of samples that the trainings of the whole run took, which each alternative may take."""
         s, trainings = self.run.settings, self.run.retraining.modes
-        first = s.stage1.samples if isinstance(s.stage1, Training) else 0
+        first = 0
+        if isinstance(s.stage1, Training):
+            attempts = range(self.run.arrivals.trainings)
+            first = sum(s.stage1.attempt(number).samples for number in attempts)
         return first + s.stage6.samples * sum(mode.attempts for mode in trainings)
 
     def training(self, algorithm: str | None = None) -> Training:

@@ -28,9 +28,11 @@ class Domain:
         starts: draws n chart points (n, d) with a generator.
         contains: (n, d) -> (n,) bool; an episode ends where it leaves the domain. By default it may go
             anywhere.
-        exit_reward: with `contains`, reward for leaving the domain, and for failing in it.
+        exit_reward: with `contains` or `reward`, reward for leaving the domain, and for failing in it.
         caution: (p,) largest error of a measurement: if given, the reward is `cautious_reward`.
         earns: (n, d) -> (n,) bool; elsewhere every step is worth the task's worst reward.
+        reward: (n, d) -> (n,) in place of the task's.
+        arrival_reward: with `reward`, that of a step which ends the episode at the goal.
     """
 
     starts: Callable[[int, np.random.Generator], np.ndarray]
@@ -38,6 +40,8 @@ class Domain:
     exit_reward: float = 0.0
     caution: np.ndarray | None = None
     earns: Callable[[np.ndarray], np.ndarray] | None = None
+    reward: Callable[[np.ndarray], np.ndarray] | None = None
+    arrival_reward: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -152,8 +156,13 @@ class BatchedEnv:
             z = self.task.z(measurement)
             if self.domain.earns is not None:
                 reward = np.where(self.domain.earns(z), reward, self.task.worst_reward)
+            if self.domain.reward is not None:
+                reward = self.domain.reward(z)
+                reward[outcome == Outcome.REACHED] = self.domain.arrival_reward
+            left = np.zeros(self.n, dtype=bool)
             if self.domain.contains is not None:
                 left = ~terminated & ~self.domain.contains(z)
+            if self.domain.reward is not None or self.domain.contains is not None:
                 # A failure costs as much: else it would end a way that costs something, and pay.
                 reward[left | (terminated & (outcome != Outcome.REACHED))] = self.domain.exit_reward
                 terminated = terminated | left

@@ -26,6 +26,7 @@ class Arrivals(artifacts.SavedAsJson):
         arrived: number of episodes that reach the goal within the task's `max_steps`, as in the game.
         missed: those of them that end farther from the set-point than the task's `close`.
         episodes: number of episodes.
+        trainings: number of trainings of which this policy is the best; 0 of an agent.
     """
 
     KIND: ClassVar[str] = "arrivals"
@@ -33,10 +34,16 @@ class Arrivals(artifacts.SavedAsJson):
     arrived: int
     missed: int
     episodes: int
+    trainings: int = 0
 
     def __str__(self) -> str:
         missed = f", in {self.missed:,} of them off the set-point" if self.missed else ""
         return f"arrives from {self.arrived:,} of {self.episodes:,} starts without noise{missed}"
+
+    @property
+    def most(self) -> bool:
+        """Whether it arrives from at least half of the starts."""
+        return 2 * self.arrived >= self.episodes
 
     @staticmethod
     def measure(task: Task, policy: Policy) -> Arrivals:

@@ -30,5 +30,6 @@ __all__ = [
     "presets",
     "setting_value",
     "symmetry",
+    "to_go",
     "training",
 ]

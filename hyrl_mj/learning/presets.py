@@ -7,7 +7,7 @@ import numpy as np
 
 from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.judging.game import LATTICE, Lattice, aligned_cells
-from hyrl_mj.learning.settings import PRESETS, Settings, Training
+from hyrl_mj.learning.settings import PRESETS, REHEARSED, Settings, Training
 from hyrl_mj.policies import Agent, algorithms
 from hyrl_mj.sets import enough_cells
 from hyrl_mj.tasks import Task, reference
@@ -59,7 +59,7 @@ _WIDE: dict[str, Any] = {
     "hidden": (128, 128),
     "spread": True,
     "normalize": True,
-    "rehearse": 0.4,
+    "rehearse": REHEARSED,
 }
 # A mirror symmetry doubles the width, see `Training.symmetric`, and halves what there is to learn.
 _WITHOUT_MIRROR: dict[str, Any] = {"hidden": (192, 192)}
@@ -221,6 +221,8 @@ def _stage1(task: Task, name: str, algorithm: str) -> Training:
             "choose preset fast or smoke"
         )
     training = _PAPER if name == "paper" else (_CONTINUOUS if levels is None else _LEVELS)[known]
+    if name == "fast":
+        training = replace(training, attempts=3)
     if name != "paper":
         if known == "ppo" and task.mirror is None:
             training = replace(training, **_WITHOUT_MIRROR)

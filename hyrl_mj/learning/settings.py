@@ -1,7 +1,7 @@
 """The settings of a run, in frozen dataclasses; `presets` makes them."""
 
-from dataclasses import dataclass, field
-from typing import Annotated, Any
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any, Self
 
 from hyrl_mj.errors import BadInput, check_bound, check_seed, unknown
 from hyrl_mj.judging import VerdictSettings
@@ -28,6 +28,8 @@ PRESETS = ("fast", "paper", "smoke")
 # Grid cells along the longest side of a chart.
 CELLS = Integer(2, 10**6)
 _SHARE = Number(0, 1)
+# Share of the episodes that start anywhere, of trainings that learn a scene that nobody has tuned them for.
+REHEARSED = 0.4
 
 
 # ---- what decides in stages 2 to 6 beside trainings and attacks: the defaults serve all tasks
@@ -176,8 +178,13 @@ class Training(Checked):
             does not explore the other way any more.
         episode: samples until an episode is truncated, by default the task's; shorter episodes cover more
             starts.
-        attempts: number of trainings, each with another seed, until a policy is good enough (stage 6 only);
-            the best policy is kept.
+        shaped: whether episodes are paid for being near to the goal by the shortest way around what ends
+            them, in place of the task's reward (stage 1 only).
+        attempts: number of trainings, each with another seed, until a policy is good enough; the best policy
+            is kept. In stage 1 it is if it arrives from half of the starts, and all but the first attempt are
+            `shaped`, the third and later ones with twice the samples and widths.
+        minutes: no further attempt begins if it would end later than so many minutes after the first began
+            (stage 1 only).
         action_noise: standard deviation of the exploration noise of TD3 and DDPG on inputs scaled to -1..1.
         options: further keyword arguments of the SB3 algorithm.
     """
@@ -199,7 +206,9 @@ class Training(Checked):
     rehearse_deciding: Annotated[float, Number(0, 1)] = 0.4
     warm_start: Annotated[bool, Flag()] = False
     episode: Annotated[int | None, Optional(Integer(1, 100_000))] = None
+    shaped: Annotated[bool, Flag()] = False
     attempts: Annotated[int, Integer(1, 1_000)] = 1
+    minutes: Annotated[float, Number(0, 100_000)] = 3.0
     action_noise: Annotated[float, Number(0, 10)] = 0.0
     options: dict[str, Any] = field(default_factory=dict)
 
@@ -218,6 +227,19 @@ class Training(Checked):
                 f"action_noise {self.action_noise:g} cannot be used, because {self.algorithm} explores "
                 "without it: give 0"
             )
+
+    def attempt(self, number: int) -> Self:
+        """Returns the settings of an attempt of stage 1, from 0 on; see `attempts`."""
+        if not number:
+            return self
+        more = 1 if number == 1 else 2
+        return replace(
+            self,
+            shaped=True,
+            rehearse=self.rehearse or REHEARSED,
+            samples=more * self.samples,
+            hidden=tuple(more * width for width in self.hidden),
+        )
 
     @property
     def title(self) -> str:

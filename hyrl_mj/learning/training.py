@@ -22,6 +22,7 @@ from hyrl_mj.gym_export.sb3_env import TaskVecEnv
 from hyrl_mj.learning import symmetry
 from hyrl_mj.learning.rehearsal import Rehearsal, running_points
 from hyrl_mj.learning.settings import Training
+from hyrl_mj.learning.to_go import WayToGo
 from hyrl_mj.policies import (
     ALGORITHMS,
     TORCH_NAMES,
@@ -307,6 +308,9 @@ class TaskGround:
 
     The score is the share of episodes that end at the set-point without noise, then the mean discounted
     return. Some of the training's episodes start anywhere, as its settings of `rehearse` say.
+
+    Raises:
+        NoWay: with `shaped`, no way leads to the goal.
     """
 
     noise: AnyNoise = Noise()
@@ -316,10 +320,14 @@ class TaskGround:
     def __init__(self, task: Task, settings: Training):
         self._task, self._gamma = task, settings.gamma
         self._rehearsal = Rehearsal(task, settings) if settings.rehearse else None
+        self._way = WayToGo(task) if settings.shaped else None
 
     def domain(self, gamma: float) -> Domain | None:
-        """Returns where episodes start if not where the task starts; they are not restricted."""
-        return Domain(self._rehearsal.starts) if self._rehearsal else None
+        """Returns where episodes start if not where the task starts, and what else they are paid for."""
+        starts = self._rehearsal.starts if self._rehearsal else self._task.starts
+        if self._way:
+            return self._way.domain(starts, gamma)
+        return Domain(starts) if self._rehearsal else None
 
     def note_losses(self, policy: MlpPolicy) -> None:
         """Notes where a policy loses and decides, for the starts of later episodes."""

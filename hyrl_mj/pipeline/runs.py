@@ -14,7 +14,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
-from hyrl_mj.errors import BadInput, HyrlError, check_seed, unknown
+from hyrl_mj.errors import BadInput, HyrlError, check_seed, counted, unknown
 from hyrl_mj.files.manifest import locked
 from hyrl_mj.judging import Arrivals, failures
 from hyrl_mj.judging.game import LATTICE
@@ -58,6 +58,8 @@ class RunOptions:
         all_coordinates: noise on every coordinate of the measurement, not only on the noisy ones of the task.
         go_on: go on also where the policy of stage 1 arrives from less than half of its starts, so that the
             other stages divide what it has not learned; preset smoke always goes on.
+        stage1_minutes: where the policy of stage 1 arrives from less than half of its starts, it is trained
+            again, paid for being near to the goal, if stage 1 takes no more minutes; by default 3.
         set: settings to change, as they stand in config.json, such as stage1.samples=300000; by default none.
         out: the run directory; by default runs/TASK.
     """
@@ -70,6 +72,7 @@ class RunOptions:
     horizon: float | None = None
     all_coordinates: bool = False
     go_on: bool = False
+    stage1_minutes: float | None = None
     set: dict[str, Any] = field(default_factory=dict)
     out: str | Path | None = None
 
@@ -269,7 +272,7 @@ def _run_all(run: Run, say: Say, stages: Collection[str] = STAGES, learned: bool
 def _check_learned(run: Run) -> None:
     """Raises `HyrlError` if the policy of stage 1 arrives from less than half of the starts."""
     task, settings, arrivals = run.task, run.settings.stage1, run.arrivals
-    if 2 * arrivals.arrived >= arrivals.episodes:
+    if arrivals.most:
         return
     assert isinstance(settings, Training)
     _, ends, nearest = failures(task, run.policy)
@@ -277,9 +280,10 @@ def _check_learned(run: Run) -> None:
     how = ", ".join(f"{count:,} {outcome.label}" for outcome, count in counts.most_common())
     near = "" if nearest is None else f", and none comes nearer to the set-point than {nearest:.3g}"
     raise HyrlError(
-        f"stage 1 has not learned {task.name}: its policy {arrivals} (the others: {how}{near}). See whether "
-        "the goal can be reached and whether the reward leads there; train longer with --set "
-        f"stage1.samples={2 * settings.samples} and another --out, or go on as it is with --go-on"
+        f"stage 1 has not learned {task.name} in {counted(arrivals.trainings, 'training')}: its policy "
+        f"{arrivals} (the others: {how}{near}). See whether the goal can be reached and whether the reward "
+        f"leads there; try more with --stage1-minutes {10 * settings.minutes:g}, or train longer with --set "
+        f"stage1.samples={2 * settings.samples}, and another --out; or go on as it is with --go-on"
     )
 
 
@@ -290,12 +294,15 @@ def settings_of(task: Task, options: RunOptions) -> Settings:
         BadInput: a value that cannot be used.
     """
     settings = _settings(task, options, algorithm=options.algorithm)
-    assert isinstance(settings.stage1, Training)
-    if settings.stage1.algorithm not in ALGORITHMS:
+    stage1 = settings.stage1
+    assert isinstance(stage1, Training)
+    if options.stage1_minutes is not None:
+        stage1 = replace(stage1, minutes=options.stage1_minutes)
+    if stage1.algorithm not in ALGORITHMS:
         from hyrl_mj.learning.training import check_foreign
 
-        check_foreign(task, settings.stage1)
-    return settings
+        check_foreign(task, stage1)
+    return replace(settings, stage1=stage1)
 
 
 def _settings(task: Task, options: RunOptions | AgentOptions, **changes: Any) -> Settings:

@@ -57,7 +57,7 @@ class Row:
             return "a title or a sentence that is too long"
         values = (self.seconds, *self.tried.values(), *self.figures.values())
         whole = 0 <= self.seed < 2**32 and 0 <= self.samples <= LARGEST_NUMBER
-        if not whole or any(abs(value) > LARGEST_NUMBER for value in values):
+        if not whole or not all(abs(value) <= LARGEST_NUMBER for value in values):
             return "a number that cannot be right"
         return None
 

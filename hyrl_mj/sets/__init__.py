@@ -7,7 +7,7 @@ dimensions; `covering` and `resolving` say which of them a chart gets.
 from hyrl_mj.sets.chart import Chart
 from hyrl_mj.sets.choice import MOST_DIMENSIONS, coarseness, covering, enough_cells, resolving
 from hyrl_mj.sets.clouds import MOST_NODES, Cloud
-from hyrl_mj.sets.grids import Grid, within_reach
+from hyrl_mj.sets.grids import Grid, shortest_ways, within_reach
 from hyrl_mj.sets.members import Complement, Everything, GridSet, Nodes, StateSet
 from hyrl_mj.sets.planes import check_points, distance_to
 
@@ -28,5 +28,6 @@ __all__ = [
     "distance_to",
     "enough_cells",
     "resolving",
+    "shortest_ways",
     "within_reach",
 ]

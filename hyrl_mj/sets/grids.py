@@ -213,6 +213,39 @@ def within_reach(mask: np.ndarray, window: np.ndarray, periodic: tuple[bool, ...
     return reached.astype(bool)
 
 
+def shortest_ways(
+    chart: Chart,
+    nodes: np.ndarray,
+    neighbours: tuple[np.ndarray, np.ndarray],
+    free: np.ndarray,
+    ends: np.ndarray,
+    farthest: float = np.inf,
+    weight: np.ndarray | None = None,
+) -> np.ndarray:
+    """Returns the length of the shortest way from each node to the nearest of some: (N,) in scaled units.
+
+    It is infinite where no way leads, or only one longer than `farthest`.
+
+    Args:
+        chart: measures the lengths.
+        nodes: (N, d).
+        neighbours: (k,), (k,) indices of nodes that lie next to each other; ways lead from one to the other.
+        free: (N,) bool, the nodes that ways may lead through.
+        ends: indices of the nodes where ways end.
+        farthest: length beyond which ways are not followed, in scaled units.
+        weight: (N,) how many times the length counts beside each node; by default once.
+    """
+    from scipy.sparse import csr_array  # slow to import
+    from scipy.sparse.csgraph import dijkstra
+
+    a, b = (side[free[neighbours[0]] & free[neighbours[1]]] for side in neighbours)
+    lengths = chart.distance(nodes[a], nodes[b])
+    if weight is not None:
+        lengths *= (weight[a] + weight[b]) / 2
+    graph = csr_array((lengths, (a, b)), shape=(len(nodes), len(nodes)))
+    return np.asarray(dijkstra(graph, directed=False, indices=ends, min_only=True, limit=farthest))
+
+
 def _unrolled(grid: Grid, mask: np.ndarray) -> tuple[np.ndarray, tuple[slice, ...]]:
     """Returns the mask with half a period more at both ends of periodic axes, and the slices of the mask.
 

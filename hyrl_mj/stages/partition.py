@@ -15,7 +15,7 @@ from hyrl_mj.files.artifacts import Saved
 from hyrl_mj.judging.game import NEVER, Limit
 from hyrl_mj.learning import WaySettings
 from hyrl_mj.policies import Policy
-from hyrl_mj.sets import GridSet, Nodes, check_points, resolving
+from hyrl_mj.sets import GridSet, Nodes, check_points, resolving, shortest_ways
 from hyrl_mj.simulation import WayRuns, policy_runs, way_runs
 from hyrl_mj.stages.refinement import refined, thinned
 from hyrl_mj.stages.ways import HomotopyClasses
@@ -154,7 +154,7 @@ def make_partition(
         neighbours = np.append(a, across[0]), np.append(b, across[1])
 
         def near(rows: np.ndarray) -> np.ndarray:
-            return _around_walls(task, nodes, (a, b), first.alive, rows, width) <= width
+            return shortest_ways(task.chart, nodes, (a, b), first.alive, rows, width) <= width
 
     ways = HomotopyClasses.from_runs(task, first, neighbours, near, settings)
     modes = ways.modes if len(points) else ()
@@ -226,35 +226,6 @@ def _across(task: Task, nodes: np.ndarray, points: np.ndarray, reach: float) -> 
     over = np.repeat(points, [len(rows) for rows in close], axis=0)
     mirrored = chart.wrap(over + chart.difference(over, nodes[first]))
     return np.unique([first, tree.query(chart.in_box(mirrored))[1]], axis=1)
-
-
-def _around_walls(
-    task: Task,
-    nodes: np.ndarray,
-    neighbours: tuple[np.ndarray, np.ndarray],
-    free: np.ndarray,
-    rows: np.ndarray,
-    farthest: float,
-) -> np.ndarray:
-    """Returns the length of the shortest way from each node to the nearest of some: (N,) in scaled units.
-
-    It is infinite where no way leads, or only one longer than `farthest`.
-
-    Args:
-        task: gives the chart.
-        nodes: (N, d).
-        neighbours: (k,), (k,) indices of nodes that lie next to each other; ways lead from one to the other.
-        free: (N,) bool, the nodes that ways may lead through.
-        rows: indices of the nodes where ways end.
-        farthest: length beyond which ways are not followed, in scaled units.
-    """
-    from scipy.sparse import csr_array  # slow to import
-    from scipy.sparse.csgraph import dijkstra
-
-    a, b = (ends[free[neighbours[0]] & free[neighbours[1]]] for ends in neighbours)
-    lengths = task.chart.distance(nodes[a], nodes[b])
-    graph = csr_array((lengths, (a, b)), shape=(len(nodes), len(nodes)))
-    return np.asarray(dijkstra(graph, directed=False, indices=rows, min_only=True, limit=farthest))
 
 
 # ---- room for an agent's modes, and a policy for each part

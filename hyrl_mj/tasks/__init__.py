@@ -23,7 +23,7 @@ from hyrl_mj.tasks.description import (
 from hyrl_mj.tasks.field import CLEAR, FASTEST, PROJECTED, RADII, TAKEN, Field, FieldTask
 from hyrl_mj.tasks.guard import check_finite, read_only, writes
 from hyrl_mj.tasks.layouts import POSE, Layouts, only_post, posts_of
-from hyrl_mj.tasks.motion import stands_still
+from hyrl_mj.tasks.motion import largest_moves, stands_still
 from hyrl_mj.tasks.obstacles import (
     ANY,
     LEFT,
@@ -78,6 +78,7 @@ __all__ = [
     "described_task",
     "get_task",
     "hidden_goal",
+    "largest_moves",
     "length",
     "number_of",
     "only_post",

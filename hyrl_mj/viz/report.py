@@ -148,6 +148,8 @@ def _stages(run: Run) -> list[tuple[str, str]]:
         assert isinstance(run.policy, MlpPolicy)
         size = sum(weight.size for weight in run.policy.weights.values())
         first = f"{s.stage1.title}, {s.stage1.samples:,} samples, no noise: {size:,} weights"
+        if (trainings := run.arrivals.trainings) > 1:
+            first += f", the best of {trainings} trainings, the later ones paid for being near to the goal"
     return [
         ("train", first),
         ("critical-set", run.critical_set.sentence(task)),

@@ -60,8 +60,9 @@ class Table:
 
     @staticmethod
     def of(title: str, rows: Sequence[Mapping[str, str]], *more: Any) -> Table:
-        """Returns a table of rows that have the same headings, at least one."""
-        return Table(title, list(rows[0]), [list(row.values()) for row in rows], *more)
+        """Returns a table of rows that have the same headings; of no rows it has none."""
+        headings = list(rows[0]) if rows else []
+        return Table(title, headings, [list(row.values()) for row in rows], *more)
 
 
 def markdown(table: Table) -> str:
