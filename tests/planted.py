@@ -127,7 +127,7 @@ def few_trials(patch):
     What these trials have to find is found in so few, too, but for what the fixture `all_trials` is for.
     That they refuse nothing which is honest is tested with all of them, in `test_trapped_environments`.
     """
-    few = {"EPISODES": 4, "SAMPLES": 16, "PLACES": 8, "RESETS": 16, "SELDOM": 60}
+    few = {"EPISODES": 4, "SAMPLES": 16, "PLACES": 8, "RESETS": 24, "SELDOM": 60}
     few |= {"RUNS": 8, "LENGTH": 40, "FAR": 2}
     for module in (inspection, trials, uses, draws, starts, resets):
         for name in few.keys() & vars(module).keys():

@@ -568,7 +568,7 @@ def test_an_end_at_the_goal_is_an_arrival_and_a_collision_is_none(make, success)
         ),
     ],
 )  # fmt: skip
-def test_conditions_that_mislead_are_refused(make, given, message):
+def test_conditions_that_mislead_are_refused(make, given, message, judged):
     with pytest.raises(BadInput, match=message):
         from_gymnasium(make, **given)
 

@@ -14,8 +14,8 @@ from hyrl_mj.gym_import.instance import Instance
 from hyrl_mj.gym_import.resets import Resets, follows
 from hyrl_mj.gym_import.trials import EPISODES, HELD, SAMPLES
 
-# Resets whose runs are compared, beside those that bring rare values, and the samples of these at most.
-COMPARED, LENGTH = 4, 100
+# Resets whose runs are compared, beside those that bring rare values.
+COMPARED = 4
 # Of what resets draw of the robot: how much of what runs reach is wide, and by how much of it the ends of
 # runs may differ.
 WIDE, APART = 1 / 3, 0.15
@@ -175,7 +175,7 @@ def _begun(instance: Instance, starts: np.ndarray, seed: int) -> tuple[Fingerpri
         seen = instance.put(start, seed)
         remembered = remembered or instance.memory()
         told.append(seen)
-        for k, result in enumerate(instance.wander(rng, LENGTH, held=10)):
+        for k, result in enumerate(instance.wander(rng, samples=100, held=10)):
             instance.take(result)
             # The first reward may be of what shapes it, and alone it is not judged by.
             first = 0 if k or "reward" in instance.spec.criterion.asked else 1
