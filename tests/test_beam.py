@@ -125,7 +125,7 @@ def test_each_part_s_policy_wins_on_its_side_of_the_beam_from_beyond_its_edges(b
     usual = preset(beam)
     points = find_critical_set(beam, policy, 16, 1 / 8, "outcome").points
     sets = extend(
-        beam, policy, points, make_partition(beam, policy, points, usual.cells // 4, eps), eps
+        beam, policy, points, make_partition(beam, policy, points, usual.cells // 3, eps), eps
     )
     assert sets.modes == (0, 1, 2, 3)
     early = sets.points[:, 0] < 0.5

@@ -444,8 +444,7 @@ def test_in_three_dimensions_the_game_is_an_estimate_beside_the_episodes(
     up = grid.nodes[:, 0] >= 0
     parts = tuple(GridSet.from_mask(grid, part) for part in (up, ~up))
     critical = CriticalSet(np.zeros((1, 3)), np.zeros(1, dtype=int), resolution=0.1, spacing=0.3)
-    partition = Partition((0, 1), parts, np.ones(len(grid.nodes), bool))
-    run = plant(path, task, critical, partition, lattice=20)
+    run = plant(path, task, critical, Partition((0, 1), parts, np.ones(len(grid.nodes), bool)))
     run_stage(run, "simulate", say=str)
     examine_run(run, ExamineOptions(episodes=8), say=str)
     page = page_of(path)

@@ -119,7 +119,7 @@ def test_only_in_its_part_does_a_mode_earn_the_reward_of_the_task(circle):
 )
 def test_the_modes_of_the_circle_settle_as_early_as_can_be_at_any_noise(circle, eps):
     # No controller settles within 0.3 rad of the set-point under greater noise than that.
-    parts, sets = circle_sets(circle, eps, cells=480)
+    parts, sets = circle_sets(circle, eps, cells=1440)
     settings = preset(circle, "fast", eps=eps).stage6
     first, result = retrain(mode_ground(circle, sets, 0, parts), settings, seed=1)
     second, _ = retrain(

@@ -293,7 +293,7 @@ def test_the_game_on_an_environment_is_an_estimate_with_its_reason(slid):
         )
     }
     points = np.array([[-1.0, 0.0]])
-    result, maps = worst_case(slid, points, halves, loops, (0.0, 0.2), False, 14)
+    result, maps = worst_case(slid, points, halves, loops, (0.0, 0.2), False, 22)
     assert result.estimate
     assert "contacts" in result.why_not_proved["policy"]
     quiet, noisy = result.scores["policy"]
