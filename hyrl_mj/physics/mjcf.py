@@ -77,8 +77,8 @@ def compiled_once() -> Iterator[None]:
     a maze. An MJCF that names other files, or comes with assets, is compiled each time.
     """
     kind: Any = mujoco.MjModel
-    if any(getattr(kind, name) != own for name, own in _OWN.items()):  # replaced by others, or by a block
-        yield
+    if any(getattr(kind, name) != own for name, own in _OWN.items()):
+        yield  # they have been replaced by others, or by a block around this one
         return
 
     def from_xml_string(xml: str, *rest: Any, **more: Any) -> mujoco.MjModel:
