@@ -62,9 +62,9 @@ def refusal(work):
 
 @pytest.fixture(autouse=True)
 def hurried(monkeypatch):
-    """What never ends is stopped after two seconds of the processor, and not after twelve."""
-    monkeypatch.setitem(limits.tried.__kwdefaults__, "seconds", 2)
-    monkeypatch.setattr(limits.limit, "__defaults__", (2, limits.MEMORY))
+    """What never ends is stopped after a second of the processor, and not after twelve."""
+    monkeypatch.setitem(limits.tried.__kwdefaults__, "seconds", 1)
+    monkeypatch.setattr(limits.limit, "__defaults__", (1, limits.MEMORY))
 
 
 @pytest.fixture

@@ -35,16 +35,19 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.wrappers import TimeLimit
 from manual import arguments_of_environments
-from planted import spare_environments, without_pdfs
+from planted import spare_environments, without_judges, without_pictures
 
 import hyrl_mj
 from hyrl_mj import BadInput, Outcome, from_gymnasium, get_task, simulate
 from hyrl_mj.gym_import import inspection, making
 from hyrl_mj.gym_import.coordinates import coordinates
+from hyrl_mj.gym_import.fingerprint import of_model
 from hyrl_mj.gym_import.instance import Instance, flat
 from hyrl_mj.gym_import.opening import Description
 from hyrl_mj.gym_import.specification import EnvironmentSpec
+from hyrl_mj.judging import results
 from hyrl_mj.learning import presets
+from hyrl_mj.physics import mjcf
 from hyrl_mj.physics.mjcf import camera_of, point_of, rests
 from hyrl_mj.physics.rendering import SceneRenderer
 from hyrl_mj.pipeline import steps
@@ -53,6 +56,8 @@ from hyrl_mj.simulation import Recorded, closed_loop
 from hyrl_mj.stages import grounds
 from hyrl_mj.system import cores
 from hyrl_mj.tasks import check_task, described_task, reference
+from hyrl_mj.viz import section
+from hyrl_mj.viz.figures import policy
 from hyrl_mj.viz.replay.marks import tracked_points
 
 # A second for each environment.
@@ -70,6 +75,13 @@ LATER = pytest.param("PointMaze_Medium-v3", marks=pytest.mark.long)
 others = pytest.mark.parametrize(
     "name", [LATER, *(name for name in OTHERS if name not in LATER.values)]
 )
+
+
+@pytest.fixture(autouse=True)
+def unjudged(request, monkeypatch):
+    """New instances judge no runs of inspections, but of the environments of other packages."""
+    if "other" not in request.fixturenames:
+        without_judges(monkeypatch)
 
 
 @pytest.fixture(scope="module")
@@ -161,8 +173,8 @@ def test_the_environment_of_a_task_gives_the_episodes_of_the_task():
         bounds={"x": (x0, x1), "y": (y0, y1)},
     )
     rng = np.random.default_rng(0)
-    z, paths = vehicle.starts(8, rng), []
-    noise = rng.uniform(-0.1, 0.1, (vehicle.max_steps, 8))
+    z, paths = vehicle.starts(4, rng), []
+    noise = rng.uniform(-0.1, 0.1, (vehicle.max_steps, 4))
     low, high = (float(limit[0]) for limit in vehicle.input_limits)
     for one, inputs in ((vehicle, (low, high)), (task, (0.0, len(vehicle.input_levels) - 1.0))):
         signal = np.zeros((*noise.shape, one.measurement_columns))
@@ -605,12 +617,47 @@ def test_code_that_is_imported_again_is_another_environment(tmp_path, monkeypatc
     del gym.registry["Changing-v0"], sys.modules["changing"]
 
 
+def test_an_mjcf_is_compiled_once_for_all_instances_unless_it_names_other_files(
+    tmp_path, monkeypatch
+):
+    compiled = []
+
+    def counting(name, own):
+        monkeypatch.setitem(mjcf._OWN, name, count := lambda xml: compiled.append(name) or own(xml))
+        monkeypatch.setattr(mujoco.MjModel, name, count)
+
+    monkeypatch.setattr(mjcf, "_LATEST", {})
+    for name, own in [*mjcf._OWN.items()]:
+        counting(name, own)
+    path = tmp_path / "puck.xml"
+    path.write_text(XML)
+    with mjcf.compiled_once():
+        one, two = Puck().model, mujoco.MjModel.from_xml_path(str(path))
+        one.body_mass[-1] = 2
+        assert compiled == ["from_xml_string"]
+        assert of_model(two) == of_model(Puck().model)
+        assert of_model(two) != of_model(one)
+        path.write_text(XML.replace('mass="1"', 'mass="3"'))
+        assert mujoco.MjModel.from_xml_path(str(path)).body_mass[-1] == 3
+        part = tmp_path / "part.xml"
+        part.write_text("<mujoco><size nuserdata='1'/></mujoco>")
+        path.write_text(f"<mujoco><include file='{part}'/></mujoco>")
+        for size in (1, 2):
+            part.write_text(f"<mujoco><size nuserdata='{size}'/></mujoco>")
+            assert mujoco.MjModel.from_xml_path(str(path)).nuserdata == size
+        with pytest.raises(ValueError, match="nowhere"):
+            mujoco.MjModel.from_xml_path("nowhere.xml")
+    assert compiled == ["from_xml_string", *["from_xml_path"] * 4]
+    assert Puck().model.body_mass[-1] == 1
+    assert len(compiled) == 6
+
+
 def test_processes_of_a_task_that_nobody_has_end():
     before = {*multiprocessing.active_children()}
-    tasks = [from_gymnasium(Puck, steps=2, seed=seed) for seed in range(2)]
+    task = from_gymnasium(Puck, steps=2)
     made = {*multiprocessing.active_children()} - before
-    assert len(made) >= 2
-    del tasks
+    assert made
+    del task
     making._RECENT.clear()
     gc.collect()
     until = time.monotonic() + 10
@@ -655,11 +702,14 @@ class Quick(Puck):
 
 def test_an_agent_is_diagnosed_and_made_robust_in_its_own_environment(tmp_path, monkeypatch):
     spare_environments(monkeypatch)
-    without_pdfs(monkeypatch)
+    without_pictures(monkeypatch)
+    monkeypatch.setattr(section, "OVER", 60)  # each cell is another start
+    monkeypatch.setattr(policy, "MAP", 30)
     monkeypatch.setitem(presets._GRIDS_DYNAMIC, 2, (14, 18))  # coarser than preset smoke
     monkeypatch.setattr(grounds, "ATTACKED", 6)
     few = {"episodes": 8, "attack_starts": 10, "attack_rounds": 1}
     monkeypatch.setattr(steps, "SPARING", replace(steps.SPARING, **few))
+    monkeypatch.setattr(results, "EPISODES", 100)
     task = from_gymnasium(Quick, steps=20, bounds={"x": (-1.7, 1.8), "y": (-1.2, 1.2)})
     path, said = tmp_path / "puck", []
     options = {"preset": "smoke", "eps": 0.1, "out": path, "say": said.append}

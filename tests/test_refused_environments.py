@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from functools import partial
+from types import SimpleNamespace
 
 import gymnasium as gym
 import mujoco
@@ -114,11 +115,6 @@ class Longer(Flat):
         return np.append(super()._get_obs(), 1.0)
 
 
-class Slow(Puck):
-    def begin(self, place):
-        time.sleep(3.2)
-
-
 ONE = Puck()
 KINDS = {
     "late": (Late, "Late cannot be reset .RuntimeError: no file"),
@@ -143,7 +139,6 @@ KINDS = {
         r"observes .* in observation\[0\], .*int64,.* SB3 shows agents",
     ),
     "more than its space": (Longer, "observes 7 number"),
-    "a slow reset": (Slow, r"reset\(\) of Slow takes 3.* s"),
 }
 
 # ---- steps
@@ -960,6 +955,13 @@ def test_generators_that_nobody_draws_from_are_like_any_memory():
     found = from_gymnasium(type("Holding", (Drawing,), values), steps=20).specification
     assert found.memoryless
     assert "episodes" not in found.found
+
+
+def test_a_slow_reset_is_refused(monkeypatch):
+    clock = SimpleNamespace(monotonic=itertools.count(0, 3.2).__next__)
+    monkeypatch.setattr(inspection, "time", clock)
+    with pytest.raises(BadInput, match=r"reset\(\) of Puck takes 3\.2 s"):
+        inspection._check_times(Instance(EnvironmentSpec(Description(Puck))))
 
 
 def test_a_slow_environment_is_said_to_take_minutes(caplog):

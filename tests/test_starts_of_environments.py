@@ -5,6 +5,7 @@ import mujoco
 import numpy as np
 import pytest
 from environments import GOAL, XML, Home, Puck
+from planted import without_judges
 
 from hyrl_mj import BadInput, from_gymnasium
 
@@ -380,7 +381,8 @@ TOO += "a fence in a box", "a fence at one place", "the place before", "a radius
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[pytest.mark.long] * (name in TOO)) for name in TABLE]
 )
-def test_what_stays_at_the_place_of_the_reset_is_refused(name):
+def test_what_stays_at_the_place_of_the_reset_is_refused(name, monkeypatch):
+    without_judges(monkeypatch)
     make, given, message = TABLE[name]
     with pytest.raises(BadInput, match=message):
         from_gymnasium(make, **{"steps": 60, **given})

@@ -273,7 +273,7 @@ def test_whether_the_chart_is_the_state_is_tried_out(puck, slid):
 
 
 def test_its_lattice_leads_to_where_it_goes_and_never_into_a_wall(slid):
-    lattice = Lattice.tabulate(slid, lattice_grid(slid, 22))
+    lattice = Lattice.tabulate(slid, lattice_grid(slid, 16))
     assert lattice.estimate
     ends = lattice.after[:, 0][:, lattice.running]
     inside = ends < lattice.nodes

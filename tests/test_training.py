@@ -95,7 +95,7 @@ def trained():
         spare(patch, checkpoints=1)
         patch.setattr(training, "EPISODES", 16)
         for name, algorithm, samples in (
-            ("unit_circle", "ppo", 2_048), ("vehicle", "dqn", 2_200), ("unit_circle", "td3", 1_200),
+            ("unit_circle", "ppo", 2_048), ("vehicle", "dqn", 2_200), ("unit_circle", "td3", 1_100),
         ):  # fmt: skip
             task = hyrl_mj.get_task(name)
             settings = preset(task, "smoke", algorithm=algorithm).stage1
@@ -108,13 +108,13 @@ def trained():
 
 @pytest.mark.slow
 def test_cores_do_not_matter():
-    """Another process, in which BLAS and torch have four threads, trains the same."""
+    """Another process, in which BLAS and torch have two threads, trains the same."""
     here = Path(__file__).parent
     program = (
         "import pickle, sys, test_training as t; sys.stdout.buffer.write(pickle.dumps(t.trained()))"
     )
     path = os.pathsep.join([str(Path(hyrl_mj.__file__).parents[1]), str(here)])
-    threads = {"OMP_NUM_THREADS": "4", "OPENBLAS_NUM_THREADS": "4"}
+    threads = {"OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2"}
     env = unmeasured.environment(PYTHONPATH=path, **threads)
     done = subprocess.run([sys.executable, "-c", program], env=env, capture_output=True, check=True)
     for own, other in zip(trained(), pickle.loads(done.stdout), strict=True):

@@ -36,12 +36,28 @@ from gymnasium.wrappers import (
     RecordEpisodeStatistics,
     TimeLimit,
 )
+from planted import without_judges
 
 from hyrl_mj import BadInput, Noise, closed_loop, from_callable, from_gymnasium, simulate
+from hyrl_mj.gym_import.opening import Description
+from hyrl_mj.gym_import.uses import check_told
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.simulation import LoopSettings, Programmes, Recorded, Rules
 
 pytestmark = pytest.mark.slow  # a second for each environment
+
+
+@pytest.fixture(autouse=True)
+def unjudged(request, monkeypatch):
+    """New instances judge the runs of tests; those of inspections only for tests that ask for `judged`."""
+    if "judged" not in request.fixturenames:
+        without_judges(monkeypatch)
+
+
+@pytest.fixture
+def judged():
+    """See `unjudged`."""
+
 
 # ---- ways on which noise does not come
 
@@ -171,11 +187,27 @@ REFUSED = {
 }  # fmt: skip
 
 
+# Of what is told in other ways the one trial is made that finds it.
+WHOLE = "info", "the place before", "a copy"
+
+
+@pytest.fixture(scope="module")
+def telling_nothing():
+    """What is known of an environment in a wrapper that shows nothing past the noise."""
+    return from_gymnasium(by("", lambda *_: []), steps=20).specification
+
+
 @pytest.mark.parametrize("way", REFUSED)
-def test_wrappers_that_observe_the_place_past_the_noise_are_refused(way):
+def test_wrappers_that_observe_the_place_past_the_noise_are_refused(way, telling_nothing, judged):
+    def look(make):
+        if way in WHOLE:
+            from_gymnasium(make, steps=20)
+        else:
+            check_told(replace(telling_nothing, description=Description(make, steps=20)))
+
     make, message = REFUSED[way]
     with pytest.raises(BadInput, match=message):
-        from_gymnasium(make, steps=20)
+        look(make)
 
 
 class Fixes(gym.Wrapper):
@@ -196,7 +228,7 @@ class Fixes(gym.Wrapper):
 
 
 class Seldomer(Fixes):
-    every = 230
+    every = 70
 
 
 class Placed(gym.ObservationWrapper):
@@ -209,7 +241,7 @@ class Placed(gym.ObservationWrapper):
 def test_what_wrappers_read_of_the_state_at_any_time_is_under_noise_or_refused():
     assert from_gymnasium(lambda: Fixes(Flat()), steps=60).specification.sensing == "now"
     assert from_gymnasium(lambda: Placed(Flat()), steps=20).specification.sensing == "earlier"
-    task = from_gymnasium(lambda: Seldomer(Flat()), steps=240)
+    task = from_gymnasium(lambda: Seldomer(Flat()), steps=80)
     assert not task.specification.sensing  # no trial is so long
     with pytest.raises(BadInput, match=r"has read from MuJoCo's state .* or reads seldom"):
         simulate(task, always(task, 0, 0), [-1.4, 0.5], Noise("uniform", 0.1))
@@ -539,7 +571,7 @@ def test_an_end_at_the_goal_is_an_arrival_and_a_collision_is_none(make, success)
         ),
     ],
 )  # fmt: skip
-def test_conditions_that_mislead_are_refused(make, given, message):
+def test_conditions_that_mislead_are_refused(make, given, message, judged):
     with pytest.raises(BadInput, match=message):
         from_gymnasium(make, **given)
 

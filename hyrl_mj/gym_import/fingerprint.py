@@ -14,10 +14,11 @@ import pickle
 import random
 import sys
 from collections import deque
-from collections.abc import Iterator, Mapping, Set
+from collections.abc import Callable, Iterator, Mapping, Set
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, partial
+from operator import attrgetter
 from types import BuiltinFunctionType, CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
 
@@ -120,13 +121,16 @@ def of_model(model: mujoco.MjModel) -> dict[str, bytes]:
 
 
 def _of_options(model: mujoco.MjModel) -> bytes:
-    options = [np.ravel(getattr(model.opt, name)) for name in _options()]
-    return np.concatenate(options, dtype=float).tobytes()
+    numbers = list[float]()
+    for value in _options()(model.opt):
+        numbers += value.ravel().tolist() if isinstance(value, np.ndarray) else [value]
+    return np.array(numbers, dtype=float).tobytes()
 
 
 @cache
-def _options() -> list[str]:
-    return [name for name in dir(mujoco.MjOption) if not name.startswith("_")]
+def _options() -> Callable[[Any], tuple[Any, ...]]:
+    """Returns what gives the values of all options."""
+    return attrgetter(*(name for name in dir(mujoco.MjOption) if not name.startswith("_")))
 
 
 def is_known(found: Fingerprint) -> bool:

@@ -47,6 +47,8 @@ from hyrl_mj.sets import Chart
 # Resets and steps of an inspection, about (without wrappers half as many resets), and from how long on it is
 # said how long it takes [s].
 TAKEN, LONG = (750, 12_000), 60.0
+# Runs under inputs at random that show what an environment does at all, and their samples at most.
+RUNS, LENGTH = 16, 150
 # What is said of an observation that shows derived quantities from before the end of a step.
 LAG = {
     "earlier": "is that of a physics step before the end of a step, with noise, too",
@@ -254,12 +256,12 @@ def _sampled(instance: Instance) -> tuple[np.ndarray, list[str]]:
     states, rewards, bodies, geoms = [], [], [], []
     info_keys: dict[str, None] = {}
     deepest, dt, harmless, remembers = 0.0, 0.0, set[int](), False
-    for seed in range(16):
+    for seed in range(RUNS):
         instance.reset(seed)
         instance.mark()
         before, began = instance.memory(), instance.data.time
         deepest = max(deepest, instance.physics.depth(instance.spec.solid))
-        for _, reward, terminated, truncated, info in instance.wander(rng, samples=150, held=15):
+        for _, reward, terminated, truncated, info in instance.wander(rng, LENGTH, held=15):
             states.append(instance.physics.read())
             dt = dt or float(instance.data.time - began)
             deepest = max(deepest, instance.physics.depth(instance.spec.solid))

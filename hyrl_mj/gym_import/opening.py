@@ -147,10 +147,11 @@ def made(description: Description) -> gym.Env:
         if isinstance(make, str):
             register(make)
             own = ":" in make  # of a module of the user's, as "my_module:Puck-v0"
-            with current_folder(make) if own else nullcontext():
+            with mjcf.compiled_once(), current_folder(make) if own else nullcontext():
                 env: Any = gym.make(make, disable_env_checker=True, **kwargs)
         else:
-            env = make(**kwargs)
+            with mjcf.compiled_once():
+                env = make(**kwargs)
     except (Exception, SystemExit) as error:  # whatever a foreign constructor raises
         if isinstance(make, str):
             raise BadInput(_why_not_made(make, error)) from error

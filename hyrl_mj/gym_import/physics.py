@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import mujoco
@@ -102,13 +102,15 @@ class Physics:
 
 def parts_of_model(model: mujoco.MjModel) -> dict[str, np.ndarray]:
     """Returns the parts of MuJoCo's model that say how it moves and hold anything, by name, as views."""
-    found = {
-        name: getattr(model, name)
-        for name in dir(model)
-        if name.startswith(MOVES)
-        and not name.endswith(("_rgba", "_matid", "_group"))  # how it looks
-    }
+    found = {name: getattr(model, name) for name in _moving_parts()}
     return {n: part for n, part in found.items() if isinstance(part, np.ndarray) and part.size}
+
+
+@cache
+def _moving_parts() -> list[str]:
+    """Returns the names of the parts of any model that say how it moves, not how it looks."""
+    looks = "_rgba", "_matid", "_group"
+    return [n for n in dir(mujoco.MjModel) if n.startswith(MOVES) and not n.endswith(looks)]
 
 
 def set_pins(env: Any, data: mujoco.MjData, pinned: Mapping[str, Any], name: str) -> None:

@@ -19,6 +19,8 @@ from hyrl_mj.tasks import Task
 SECTIONS = 24  # over the period of a coordinate
 # Least number of cells along the longest side in the search for the critical points of a section.
 CELLS = 40
+# Cells along the longest side of the map of where runs end without success.
+OVER = 480
 
 
 class Section:
@@ -74,7 +76,7 @@ class Section:
     @cached_property
     def over(self) -> GridSet | None:
         """The points at which a run ends without success, with a smooth outline; None if there are none."""
-        grid = Grid.with_cells(self.chart, 480)
+        grid = Grid.with_cells(self.chart, OVER)
         over = self.failed(grid.nodes).reshape(grid.counts)
         # Blurred, the mask has a smooth outline where it is one half, without the steps of its cells.
         blurred = gaussian_filter(over.astype(float), 4, mode="nearest")

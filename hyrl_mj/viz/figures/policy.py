@@ -21,6 +21,8 @@ from hyrl_mj.viz.figures.shown import ShownPolicy
 from hyrl_mj.viz.section import Section
 from hyrl_mj.viz.tables import NAMED
 
+# Cells along the longest side of a map of inputs.
+MAP = 240
 ENDS = {
     Outcome.RUNNING: OPEN,
     Outcome.REACHED: PALE,
@@ -172,7 +174,7 @@ def draw_policy_map(shown: ShownPolicy) -> Figure:
     with style.drawing(5.2, section, f"the {shown.algorithm} policy") as figure:
         *maps, panel = figure.subplots(1, len(task.inputs) + 1)
         ring = charts.is_ring(chart)
-        grid = Grid(chart, (720,)) if ring else Grid.with_cells(chart, 240)
+        grid = Grid(chart, (720,)) if ring else Grid.with_cells(chart, MAP)
         inputs = shown.policy.act(task.at(section.lift(grid.nodes)))
         for i, input_panel in enumerate(maps):
             _input_map(input_panel, shown, grid, inputs, i)
