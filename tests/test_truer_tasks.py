@@ -92,6 +92,17 @@ def test_a_class_that_was_changed_after_its_file_was_executed_is_refused(name, v
     assert not (tmp_path / "run").exists()
 
 
+def test_a_module_beside_a_task_that_was_changed_in_memory_is_refused(tmp_path):
+    (tmp_path / "poles.py").write_text("RADIUS = 0.6\n")
+    ending = PY["ending"].replace(CRASH, "<= poles.RADIUS]")
+    task = get_task(write(tmp_path, {"ending": ending}, top="import poles\n"))
+    assert check_task(task) is task
+    sys.modules["poles"].RADIUS = 0.7
+    with pytest.raises(BadInput, match=r"ending\(\) gives .* executed once more"):
+        check_task(task)
+    assert sys.modules["poles"].RADIUS == 0.7
+
+
 @pytest.mark.parametrize(
     ("code", "said"),
     [

@@ -179,6 +179,13 @@ def _public(kind: type) -> Iterator[str]:
 def _check_parts(task: Task) -> None:
     if missing := [name for name in Task.__annotations__ if not hasattr(task, name)]:
         raise BadInput(f"it has no {', '.join(missing)}: add what is missing")
+    if (
+        type(task).__eq__ is not object.__eq__
+    ):  # what is found out about one would be said of another
+        raise BadInput(
+            "its class says which tasks are equal (a dataclass, or __eq__): leave that out, as "
+            "@dataclass(eq=False) does"
+        )
     for name, kind in (("chart", Chart), ("scene", Scene), ("learning", Learning)):
         if not isinstance(value := getattr(task, name), kind):
             raise BadInput(f"{name} is {value!r}: give a hyrl_mj.{kind.__name__}(...)")
@@ -193,8 +200,12 @@ def _check_parts(task: Task) -> None:
             "those in which the decision is made; the measurement may have more"
         )
     for name in ("units", "low", "high", "periodic", "scale"):
-        if (count := len(getattr(chart, name))) != d:
+        if (count := np.size(getattr(chart, name))) != d:
             raise BadInput(f"its chart has {d} name(s) and {count} value(s) of {name}: give {d}")
+    if len(set(chart.names)) < d or not all(isinstance(name, str) for name in chart.names):
+        raise BadInput(
+            f"its chart has the names {chart.names}: give each coordinate a text of its own"
+        )
     if not (np.isfinite(chart.sides).all() and (chart.sides > 0).all()):
         raise BadInput("its chart has a side that is not positive: give low < high, both finite")
     if not (np.isfinite(chart.scale).all() and np.greater(chart.scale, 0).all()):

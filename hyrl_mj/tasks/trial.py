@@ -113,10 +113,11 @@ def _try_again(task: Task) -> None:
         return
     for name in sorted(vars(Task)["__annotations__"].keys() - {"source", "env_id", "spec"}):
         now, again = getattr(task, name, None), getattr(twin, name, None)
-        own = (
-            type(again).__module__ == type(twin).__module__
-        )  # a class of the file is made again, too
-        if not (name.startswith("_") or own or alike(now, again)):
+        kinds = type(now), type(again)
+        anew = (
+            kinds[0] is not kinds[1] and kinds[0].__name__ == kinds[1].__name__
+        )  # a class of the file
+        if not (name.startswith("_") or anew or alike(now, again)):
             raise BadInput(
                 f"{name} is {now!r:.60}, and {again!r:.60} where {task.source} is executed once more, as "
                 "each process does that opens a run: change it in the file"
