@@ -531,6 +531,8 @@ def test_operations_survive_both_forms(name):
     space = {"np": np, "ARRAYS": arrays}
     exec(source, space)
     model = write_graph(program, ("y",), "f", {})
+    read = {name for node in model.graph.node for name in node.input}
+    assert {constant.name for constant in model.graph.initializer} <= read
     session = onnxruntime.InferenceSession(model.SerializeToString())
     for n in (1, 5, 300):
         x = 2 * RNG(n).normal(size=(n, 3))
