@@ -322,6 +322,9 @@ def test_an_inner_loop_gets_its_inputs_at_each_step(tmp_path):
     path.write_text(path.read_text().replace('inputs = ("u",)', 'inputs = ("side",)'))
     with pytest.raises(BadInput, match=r"control\(\) .* writes to an array"):
         simulate(get_task(path), Steer(), [0.0, 0.5])
+    path.write_text(path.read_text().replace("u *= 0.5", "u = u - u.mean(axis=0)"))
+    with pytest.raises(BadInput, match=r"control\(\) gives .* for the same row"):
+        trial.try_methods(get_task(path))
 
 
 def test_an_input_may_act_only_where_another_one_does(tmp_path):
