@@ -82,11 +82,14 @@ def test_an_object_that_no_run_leads_to_is_refused(wide, tmp_path):
 
 
 @pytest.mark.parametrize(("name", "value"), [("max_steps", 30), ("noisy", (1, 1)), ("close", 0.9)])
-def test_a_class_that_was_changed_after_its_file_was_executed_is_refused(name, value, tmp_path):
+def test_a_class_that_was_changed_after_its_file_was_executed_is_refused(
+    name, value, tmp_path, monkeypatch
+):
     path = write(tmp_path)
-    kind = type(get_task(path))
-    setattr(kind, name, value)
-    for task in (path, kind()):
+    kind, other = type(get_task(path)), imported(write(tmp_path), monkeypatch).Robot
+    for changed in (kind, other):
+        setattr(changed, name, value)
+    for task in (path, kind(), other()):
         with pytest.raises(BadInput, match=rf"{name} is .* executed once more, .* in the file"):
             hyrl_mj.run(task, preset="smoke", out=tmp_path / "run")
     assert not (tmp_path / "run").exists()

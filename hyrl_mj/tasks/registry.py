@@ -294,9 +294,9 @@ def made_again(task: Task) -> Task | None:
     What it imports from its folder is executed, too, unless that can be done once only.
     """
     kind = type(task)
-    if kind not in _FILES.values():
+    # A script may do anything where it is executed, such as to begin this run once more.
+    if kind.source is None or kind.__module__ == "__main__" or not kind.source.is_file():
         return None
-    assert kind.source is not None
     known, name = dict(_REGISTRY), f"{kind.__module__}_again"
     for helpers in (forget_helpers(kind.source), {}):
         try:
