@@ -283,6 +283,15 @@ MISTAKES = {
     "an actuator of another name": (XML, 'name="lateral"', 'name="side"', r"'lateral'.*side"),
     "a limit is missing": (XML, ' ctrlrange="-1 1"', "", r"lateral needs a ctrlrange"),
     "a chart of the wrong dimension": (PY, r'\("m", "m"\)', '("m",)', r"2 name.*1 value.*units"),
+    "one number for two ends": (PY, r"\(0\.0, -1\.5\)", "0.0", r"2 name.*1 value.*low"),
+    "two coordinates of one name": (PY, r'\("x", "y"\)', '("y", "y")', r"a text of its own"),
+    "a dataclass": (
+        PY, "@hyrl_mj.register", "from dataclasses import dataclass\n@hyrl_mj.register\n@dataclass",
+        r"which tasks are equal.*dataclass\(eq=False\)",
+    ),
+    "an id that Gymnasium does not take": (
+        PY, "    max_steps", '    env_id = "my id"\n    max_steps', r"env_id 'my id'.*Malformed",
+    ),
     "a z of the wrong dimension": (
         PY, "    def obs", "    def z(self, m):\n        return m[:, :1]\n\n    def obs",
         r"z\(\) .* gives shape \(64, 1\)",

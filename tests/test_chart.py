@@ -81,3 +81,9 @@ def test_points_are_brought_next_to_others_by_whole_periods():
     np.testing.assert_array_equal(near[:, 0], z[:, 0])
     np.testing.assert_allclose(near[:, 1], [3.1, -3.1 + 4 * np.pi, 0.5 - 8 * np.pi])
     assert near[0, 1] == z[0, 1], "a point that is near stays the same to the bit"
+
+
+def test_arrays_and_lists_are_taken_as_tuples():
+    given = Chart(["theta"], ["rad"], np.zeros(1), np.array([2 * PI]), np.array([True]))
+    assert given == CHARTS["ring"]
+    assert hash(given) == hash(CHARTS["ring"])

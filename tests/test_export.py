@@ -338,6 +338,21 @@ def quietly(x):
     return seen
 
 
+def silently(x):
+    try:
+        return np.hstack([x, np.interp(x, [0, 7], [0, 7])])
+    except:  # noqa: E722 - as code of users has it
+        return np.hstack([x, x])
+
+
+def perhaps_copied(x, copied):
+    whole = np.hstack([x, x])
+    part = copied(whole)
+    whole[:, 0] -= 1
+    return np.stack([part, whole[:, 1]], axis=1)
+
+
+COPIED = (lambda a: a[:, 0:1].ravel(), lambda a: np.ascontiguousarray(a[:, 0]))
 PARTS = (
     lambda a: a[:, :1],
     lambda a: a.reshape(-1, 1, 2),
@@ -351,7 +366,9 @@ PART = "writes to a part of an array by a name of its own"
     ("method", "said"),
     [
         *((partial(through_a_part, taken=taken), PART) for taken in PARTS),
+        *((partial(perhaps_copied, copied=copied), "may be a copy") for copied in COPIED),
         (quietly, "branches on values"),
+        (silently, r"uses np\.interp"),
         (lambda x: np.hstack([np.cos(x), np.interp(x, [0, 7], [0, 1])]), r"uses np\.interp"),
         (lambda x: np.hstack([x, x]) if x[0, 0] > 1 else np.hstack([x, -x]), "picks single rows"),
         (lambda x: np.hstack([x, x]) if (x > 1).any(axis=1) else x, "branches on values"),
@@ -360,6 +377,7 @@ PART = "writes to a part of an array by a name of its own"
         (lambda x: np.hstack([x[x > 1][:, None], x]), "depends on values"),
         (lambda x: np.hstack([x, np.linspace(0, 1, 9)[x.astype(int)]]), "plain numbers"),
         (lambda x: np.hstack([x, x.sum(axis=1, dtype=float)[:, None]]), r"np\.sum with arguments"),
+        (lambda x: np.hstack([x, np.array(x[:, 0], ndmin=2).T]), "with ndmin"),
         (lambda x: np.hstack([x, x.spam]), r"uses \.spam"),
         (lambda x: np.hstack([x, np.arange(len(x))[:, None] * x]), "does not do what"),
     ],
@@ -448,9 +466,11 @@ def under_other_names(x):
     as_it_is[x > 1] = 7
     of_its_type[:, 0] -= 1
     first, turned, flat = made[:, :2], made.T[1], made.reshape(-1, 3, 1)
+    copied = made[:, 2].flatten()
+    copied -= 3
     made[:, 2] = first[:, 0] + turned
     made[:, 1] = 2 * flat[:, 2, 0] - turned
-    made[:, 0] += first[:, 1]
+    made[:, 0] += first[:, 1] + copied
     return made if isinstance(x, np.ndarray) else x
 
 
@@ -484,6 +504,9 @@ WHOLE = {
     "stacks": lambda x: np.hstack([np.vstack([x.T, x.T]).T, np.zeros((len(x), 2)), np.ones_like(x)]),
     "full": lambda x: np.full((len(x), 2), 0.5) + np.full_like(x[:, :2], 2) + np.zeros_like(x[:, 1:]),
     "full of a row": lambda x: x * np.full((len(x), 3), [1.0, 2.0, 3.0]),
+    "repeated rows": lambda x: np.concatenate(
+        [x * np.tile([1.0, 2.0, 3.0], (len(x), 1)), np.broadcast_to([4.0], (len(x), 1))], axis=1
+    ),
     "under other names": under_other_names,
     "deep copies": lambda x: copy.deepcopy(x) + copy.copy(x),
     "indices": lambda x: np.concatenate([x[:, [2, 0]], x[:, -1:], x[:, 1][:, None]], axis=1),
@@ -508,6 +531,8 @@ def test_operations_survive_both_forms(name):
     space = {"np": np, "ARRAYS": arrays}
     exec(source, space)
     model = write_graph(program, ("y",), "f", {})
+    read = {name for node in model.graph.node for name in node.input}
+    assert {constant.name for constant in model.graph.initializer} <= read
     session = onnxruntime.InferenceSession(model.SerializeToString())
     for n in (1, 5, 300):
         x = 2 * RNG(n).normal(size=(n, 3))

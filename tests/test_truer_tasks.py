@@ -6,6 +6,7 @@ import os
 import pickle
 import subprocess
 import sys
+from contextlib import nullcontext
 
 import mujoco
 import numpy as np
@@ -80,6 +81,50 @@ def test_an_object_that_no_run_leads_to_is_refused(wide, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize(("name", "value"), [("max_steps", 30), ("noisy", (1, 1)), ("close", 0.9)])
+def test_a_class_that_was_changed_after_its_file_was_executed_is_refused(
+    name, value, tmp_path, monkeypatch
+):
+    path = write(tmp_path)
+    kind, other = type(get_task(path)), imported(write(tmp_path), monkeypatch).Robot
+    for changed in (kind, other):
+        setattr(changed, name, value)
+    for task in (path, kind(), other()):
+        with pytest.raises(BadInput, match=rf"{name} is .* executed once more, .* in the file"):
+            hyrl_mj.run(task, preset="smoke", out=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_module_beside_a_task_that_was_changed_in_memory_is_refused(tmp_path):
+    (tmp_path / "poles.py").write_text("RADIUS = 0.6\n")
+    ending = PY["ending"].replace(CRASH, "<= poles.RADIUS]")
+    task = get_task(write(tmp_path, {"ending": ending}, top="import poles\n"))
+    assert check_task(task) is task
+    sys.modules["poles"].RADIUS = 0.7
+    with pytest.raises(BadInput, match=r"ending\(\) gives .* executed once more"):
+        check_task(task)
+    assert sys.modules["poles"].RADIUS == 0.7
+
+
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [
+        (
+            "    sensors = 'uniform 0.1'\n",
+            "defines sensors, which nothing uses: if sensor is meant",
+        ),
+        ("    def verdicts(self, m):\n        return 0 * m[:, 0]\n", "if verdict is meant"),
+        ("    starting = 0.1\n    def stated(self):\n        return self.stated\n", None),
+    ],
+)
+def test_an_attribute_that_nothing_uses_is_refused_if_another_one_may_be_meant(
+    code, said, tmp_path
+):
+    task = get_task(write(tmp_path, {"methods": code}))
+    with pytest.raises(BadInput, match=said) if said else nullcontext():
+        check_task(task)
+
+
 def test_a_task_file_is_read_as_it_is_now(tmp_path):
     path = write(tmp_path)
     first = get_task(path)
@@ -107,6 +152,21 @@ def test_a_model_is_compiled_as_its_files_are_now(tmp_path):
     second = get_task(path)
     assert second.model.geom("mark").size[0] == 0.2
     assert first.code != second.code
+
+
+def test_a_height_field_is_a_part_of_its_model(tmp_path):
+    """MuJoCo tells its name without the folder in which it looks for it."""
+    path, field = tmp_path / "model.xml", tmp_path / "meshes" / "hills.bin"
+    field.parent.mkdir()
+    asset = '<asset><hfield name="hills" file="hills.bin" size="1 1 1 1"/></asset>'
+    path.write_text(f'<mujoco><compiler meshdir="meshes"/>{asset}</mujoco>')
+    seen = []
+    for height in (0.2, 0.7):
+        size, heights = np.array([2, 2], dtype=np.int32), np.array([0, 0, height, 1], np.float32)
+        field.write_bytes(size.tobytes() + heights.tobytes())
+        assert mjcf.load(path).nhfield == 1
+        seen.append(mjcf.file_digest(path))
+    assert seen[0] != seen[1]
 
 
 def test_what_lies_beside_a_task_is_part_of_it(tmp_path):
@@ -265,6 +325,9 @@ def test_an_inner_loop_gets_its_inputs_at_each_step(tmp_path):
     path.write_text(path.read_text().replace('inputs = ("u",)', 'inputs = ("side",)'))
     with pytest.raises(BadInput, match=r"control\(\) .* writes to an array"):
         simulate(get_task(path), Steer(), [0.0, 0.5])
+    path.write_text(path.read_text().replace("u *= 0.5", "u = u - u.mean(axis=0)"))
+    with pytest.raises(BadInput, match=r"control\(\) gives .* for the same row"):
+        trial.try_methods(get_task(path))
 
 
 def test_an_input_may_act_only_where_another_one_does(tmp_path):

@@ -128,7 +128,9 @@ LOWERED: dict[str, Callable[[_Graph, Operation], str]] = {
     "transpose": lambda g, o: g.node("Transpose", g.get(o.operands[0]), perm=o.options["axes"]),
     "argmax": lambda g, o: g.node("ArgMax", g.get(o.operands[0]), **o.options),
     "argmin": lambda g, o: g.node("ArgMin", g.get(o.operands[0]), **o.options),
-    "where": lambda g, o: g.node("Where", g.get(o.operands[0], bool), *g.operands(o)[1:]),
+    "where": lambda g, o: g.node(
+        "Where", g.get(o.operands[0], bool), *(g.get(x, o.value.dtype) for x in o.operands[1:])
+    ),
     "concatenate": lambda g, o: g.node("Concat", *g.operands(o), **o.options),
     "full": lambda g, o: g.node("Expand", *g.operands(o), g.shape(o)),
     "take": lambda g, o: g.node(

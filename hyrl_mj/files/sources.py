@@ -17,7 +17,7 @@ from importlib.machinery import (
 )
 from itertools import product
 from pathlib import Path
-from types import CodeType
+from types import CodeType, ModuleType
 
 from hyrl_mj.errors import BadInput
 
@@ -116,11 +116,13 @@ def check_helpers(path: Path) -> None:
             )
 
 
-def forget_helpers(path: Path) -> None:
-    """Lets what a task imports from its folder be imported anew."""
+def forget_helpers(path: Path) -> dict[str, ModuleType]:
+    """Lets what a task imports from its folder be imported anew; returns what was imported so far."""
     names = _beside(path)
-    for module in [m for m in sys.modules if m.partition(".")[0] in names]:
+    found = {m: module for m, module in sys.modules.items() if m.partition(".")[0] in names}
+    for module in found:
         del sys.modules[module]
+    return found
 
 
 def _beside(path: Path) -> set[str]:

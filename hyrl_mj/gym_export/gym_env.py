@@ -70,7 +70,7 @@ class TaskEnv(gym.Env[np.ndarray, Any]):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise BadInput(f"render_mode {render_mode!r} is unknown: use None or 'rgb_array'")
         self.core = BatchedEnv(described_task(task), 1, noise=noise, threads=1)
-        self.metadata = {**self.metadata, "render_fps": round(1 / self.core.task.dt)}
+        self.metadata = {**self.metadata, "render_fps": max(round(1 / self.core.task.dt), 1)}
         self.observation_space = observation_space(self.core.task)
         self.action_space = action_space(self.core.task)
         self.render_mode, self._size = render_mode, (width, height)

@@ -4,6 +4,8 @@ So that these are written nowhere else.
 """
 
 import copy
+import os
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from difflib import get_close_matches
@@ -118,7 +120,16 @@ def file_digest(path: Path) -> str:
     found = sha256(content)
     if b"file" in content and models_dir() not in path.resolve().parents:
         with suppress(mujoco.FatalError):  # the compiler will tell
-            for part in sorted(map(Path, mujoco.mju_getXMLDependencies(str(path)))):
+            parts = sorted(map(Path, mujoco.mju_getXMLDependencies(str(path))))
+            texts = b"".join(
+                p.read_bytes() for p in (path, *parts) if p.suffix == ".xml" and p.is_file()
+            )
+            # MuJoCo does not say in which folder height fields lie.
+            folders = sorted({*re.findall(rb"(?:mesh|asset)dir\s*=\s*[\"']([^\"']+)", texts)})
+            for part in [p for p in parts if not p.is_file()]:
+                name = os.path.relpath(part, path.parent)
+                parts += [path.parent / os.fsdecode(folder) / name for folder in folders]
+            for part in parts:
                 if part.is_file():
                     found.update(sha256(part.read_bytes()).digest())
     return found.hexdigest()

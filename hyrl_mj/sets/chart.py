@@ -41,6 +41,10 @@ class Chart:
     scale: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
+        for name in ("names", "units", "low", "high", "periodic", "scale"):
+            # Charts are compared, and are keys: arrays and lists are taken as tuples.
+            if isinstance(values := getattr(self, name), np.ndarray | list):
+                object.__setattr__(self, name, tuple(np.asarray(values).tolist()))
         for name in (*self.names, *self.units, self.section):
             if len(str(name)) > LONGEST or has_controls(str(name)):
                 raise BadInput(

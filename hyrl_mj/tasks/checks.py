@@ -1,6 +1,8 @@
 """Checks that a task is complete and consistent, before anything is trained."""
 
 import re
+from collections.abc import Iterator
+from difflib import get_close_matches
 from operator import attrgetter
 
 import mujoco
@@ -73,20 +75,19 @@ def overlooked(task: Task) -> str:
     """Returns where `ending` lets a robot go on that is in the middle of an obstacle; "" if nowhere.
 
     That is where a geom of the robot is as deep inside of one whose name begins with "obstacle" as it is
-    wide. Where contacts only stop a robot no episode comes to such places. Models with mocap are not asked.
+    wide. Where contacts only stop a robot no episode comes to such places.
     """
     model = task.model
     obstacles = [model.geom(name).id for name in mjcf.obstacles(model)]
     moves = model.body_weldid[model.geom_bodyid] != 0
     meets = model.geom_contype | model.geom_conaffinity  # what only shows meets nothing
     own = np.setdiff1d(np.flatnonzero(moves & (meets != 0)), obstacles)
-    if not obstacles or not len(own) or model.nmocap or task.abilities.stopped_by_walls:
+    if not obstacles or not len(own) or task.abilities.stopped_by_walls:
         return ""
     z = task.chart.draw(OVERLAPS, np.random.default_rng(0))
     plant, data = task.placed(z), mujoco.MjData(model)
     for i in np.flatnonzero(task.ending(plant.measurement) == Outcome.RUNNING):
-        data.qpos[:] = plant.qpos[i]
-        mujoco.mj_kinematics(model, data)
+        mjcf.place(model, data, plant.qpos[i], task.mocap)
         for geom in own:
             width = model.geom_size[geom][model.geom_size[geom] > 0].min(initial=np.inf)
             for obstacle in obstacles:
@@ -155,11 +156,32 @@ def _check_names(task: Task) -> None:
         raise BadInput(
             f"it defines {', '.join(taken)}, which hyrl_mj computes and asks for: give it another name"
         )
+    if task.source is None or not task.source.is_file():
+        return
+    said, asked_for = task.source.read_text(encoding="utf-8", errors="replace"), [*_public(Task)]
+    for name in sorted(names.difference(asked_for)):
+        if name.startswith("_") or len(re.findall(rf"\b{re.escape(name)}\b", said)) > 1:
+            continue
+        if meant := get_close_matches(name, asked_for, 1, 0.85):
+            raise BadInput(
+                f"it defines {name}, which nothing uses: if {meant[0]} is meant, call it so, or leave it out"
+            )
+
+
+def _public(kind: type) -> Iterator[str]:
+    """Yields the names of what a class has, or only declares, but for those that begin with "_"."""
+    yield from (name for name in {*dir(kind), *kind.__annotations__} if not name.startswith("_"))
 
 
 def _check_parts(task: Task) -> None:
     if missing := [name for name in Task.__annotations__ if not hasattr(task, name)]:
         raise BadInput(f"it has no {', '.join(missing)}: add what is missing")
+    # What is found out about one task would be said of another.
+    if type(task).__eq__ is not object.__eq__:
+        raise BadInput(
+            "its class says which tasks are equal (a dataclass, or __eq__): leave that out, as "
+            "@dataclass(eq=False) does"
+        )
     for name, kind in (("chart", Chart), ("scene", Scene), ("learning", Learning)):
         if not isinstance(value := getattr(task, name), kind):
             raise BadInput(f"{name} is {value!r}: give a hyrl_mj.{kind.__name__}(...)")
@@ -174,8 +196,12 @@ def _check_parts(task: Task) -> None:
             "those in which the decision is made; the measurement may have more"
         )
     for name in ("units", "low", "high", "periodic", "scale"):
-        if (count := len(getattr(chart, name))) != d:
+        if (count := np.size(getattr(chart, name))) != d:
             raise BadInput(f"its chart has {d} name(s) and {count} value(s) of {name}: give {d}")
+    if len(set(chart.names)) < d or not all(isinstance(name, str) for name in chart.names):
+        raise BadInput(
+            f"its chart has the names {chart.names}: give each coordinate a text of its own"
+        )
     if not (np.isfinite(chart.sides).all() and (chart.sides > 0).all()):
         raise BadInput("its chart has a side that is not positive: give low < high, both finite")
     if not (np.isfinite(chart.scale).all() and np.greater(chart.scale, 0).all()):
@@ -297,8 +323,6 @@ def _check_starts(task: Task) -> None:
             f"the first keyframe in {task.model_path.name} has velocities (qvel), and its episodes begin at "
             "rest: let state() give them, or leave them out"
         )
-    if task.model.nmocap:
-        _check_mocap(task, plant.qpos)
     measurement = plant.measurement
     if measurement.shape != (STARTS, p):
         raise BadInput(
@@ -439,18 +463,6 @@ def _check_ways(task: Task) -> None:
         raise BadInput(
             f"its chart has one coordinate ({task.chart.names[0]}), and ways past obstacles are told apart "
             f"in a plane: give the task a where(measured), {own}"
-        )
-
-
-def _check_mocap(task: Task, qpos: np.ndarray) -> None:
-    """Raises `BadInput` unless mocap() gives each row of positions (n, nq) poses that depend on it alone."""
-    poses = mjcf.mocap_poses(task.model, task.mocap, qpos)
-    backward = mjcf.mocap_poses(task.model, task.mocap, qpos[::-1])[::-1]
-    if not np.allclose(poses, backward, rtol=0, atol=1e-9):
-        row = int(np.abs(poses - backward).max(axis=(1, 2)).argmax())
-        raise BadInput(
-            f"mocap() puts the bodies at {poses[row].tolist()} and then at {backward[row].tolist()} for the "
-            f"same qpos {qpos[row].tolist()}: let it depend on qpos alone, each row on its own"
         )
 
 

@@ -56,14 +56,17 @@ def register(task: type[Task]) -> type[Task]:
             f"{here} defines an environment {task.env_id}, and there is another: rename the class, or give "
             "it an env_id"
         )
+    try:
+        gym.register(
+            id=task.env_id,
+            entry_point="hyrl_mj.gym_export.gym_env:TaskEnv",
+            vector_entry_point="hyrl_mj.gym_export.gym_env:TaskVectorEnv",
+            kwargs={"task": task.name},
+            max_episode_steps=getattr(task, "max_steps", None),  # `check_task` says what is missing
+        )
+    except gym.error.Error as error:
+        raise BadInput(f"{here} has the env_id {task.env_id!r:.60} ({brief(error)})") from error
     _REGISTRY[task.name] = task
-    gym.register(
-        id=task.env_id,
-        entry_point="hyrl_mj.gym_export.gym_env:TaskEnv",
-        vector_entry_point="hyrl_mj.gym_export.gym_env:TaskVectorEnv",
-        kwargs={"task": task.name},
-        max_episode_steps=getattr(task, "max_steps", None),  # `check_task` says what is missing
-    )
     return task
 
 
@@ -286,22 +289,28 @@ def _by_reference(task: Task) -> tuple[Callable[[str], Task], tuple[str], dict[s
 
 
 def made_again(task: Task) -> Task | None:
-    """Returns the task of a file that is executed once more; None of a task that no file makes twice."""
+    """Returns the task of a file that is executed once more; None of a task that no file makes twice.
+
+    What it imports from its folder is executed, too, unless that can be done once only.
+    """
     kind = type(task)
-    if kind not in _FILES.values():
+    # A script may do anything where it is executed, such as to begin this run once more.
+    if kind.source is None or kind.__module__ == "__main__" or not kind.source.is_file():
         return None
-    assert kind.source is not None
     known, name = dict(_REGISTRY), f"{kind.__module__}_again"
-    try:
-        again: type[Task] = getattr(_executed(kind.source, name), kind.__name__)
-        again.source = kind.source
-        return again()
-    except Exception:  # such as of what can be registered once
-        return None
-    finally:
-        sys.modules.pop(name, None)
-        _REGISTRY.clear()
-        _REGISTRY.update(known)
+    for helpers in (forget_helpers(kind.source), {}):
+        try:
+            again: type[Task] = getattr(_executed(kind.source, name), kind.__name__)
+            again.source = kind.source
+            return again()
+        except Exception:  # such as of what can be registered once
+            continue
+        finally:
+            sys.modules.pop(name, None)
+            sys.modules.update(helpers)
+            _REGISTRY.clear()
+            _REGISTRY.update(known)
+    return None
 
 
 def _run(path: Path) -> ModuleType:

@@ -111,6 +111,17 @@ def _try_again(task: Task) -> None:
     """Raises `BadInput` if a method differs where the file of a task is executed once more."""
     if (twin := made_again(task)) is None:
         return
+    for name in sorted(vars(Task)["__annotations__"].keys() - {"source", "env_id", "spec"}):
+        now, again = getattr(task, name, None), getattr(twin, name, None)
+        kinds = type(now), type(again)
+        anew = (
+            kinds[0] is not kinds[1] and kinds[0].__name__ == kinds[1].__name__
+        )  # a class of the file
+        if not (name.startswith("_") or anew or alike(now, again)):
+            raise BadInput(
+                f"{name} is {now!r:.60}, and {again!r:.60} where {task.source} is executed once more, as "
+                "each process does that opens a run: change it in the file"
+            )
     z = task.chart.draw(ANYWHERE, np.random.default_rng(0))
     measured, every = task.placed(z).measurement, np.arange(len(z))
     asked = _methods(twin, z, measured)
@@ -186,6 +197,15 @@ def _methods(task: Task, z: np.ndarray, measured: np.ndarray) -> dict[str, OfRow
     names += ["danger"] if task.gives_direction else ["danger", "where"]
     found = {name: of_measured(name) for name in names}
     found |= {"state": state, "reward": reward, "miss": lambda rows: task.miss(z[rows])}
+    rng = np.random.default_rng(0)
+    qpos, u = task.placed(z).qpos, task.draw_inputs(len(z), rng)
+    qvel = rng.normal(size=(len(z), task.model.nv))
+    if task.has_inner_loop:
+        found["control"] = lambda rows: task.control(u[rows], qpos[rows], qvel[rows])
+    if task.model.nmocap:
+        found["mocap"] = lambda rows: np.hstack(
+            [*np.moveaxis(mjcf.mocap_poses(task.model, task.mocap, qpos[rows]), 1, 0)]
+        )
     if task.gives_direction:
         found["direction"] = lambda rows: task.direction(path[:, rows])
     return found

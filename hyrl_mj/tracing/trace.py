@@ -18,8 +18,15 @@ from typing import Any
 import numpy as np
 
 from hyrl_mj.errors import BadInput, brief
-from hyrl_mj.tracing.traced_array import Operation, Program, Traced, apply, take
-from hyrl_mj.tracing.vocabulary import BATCH, REDUCTIONS, Untraceable
+from hyrl_mj.tracing.traced_array import (
+    Operation,
+    Program,
+    Traced,
+    apply,
+    shared_or_copied,
+    take,
+)
+from hyrl_mj.tracing.vocabulary import BATCH, RAISED, REDUCTIONS, Untraceable
 
 
 def trace(
@@ -40,9 +47,13 @@ def trace(
         BadInput: the function cannot be traced.
     """
     inputs = tuple(Operation("input", (key,), {}, value) for key, value in samples.items())
+    raised: list[BaseException] = []
+    before = RAISED.set(raised)
     try:
         with np.errstate(all="ignore"):
             results = _PrivateCopies().copy_of(function)(*map(Traced, inputs))
+        if raised:
+            raise raised[0]
         results = results if isinstance(results, tuple) else (results,)
         if not all(isinstance(r, Traced) and r.shape[:1] == (BATCH,) for r in results):
             raise BadInput(
@@ -58,13 +69,18 @@ def trace(
             f"{name} cannot be {purpose}: it raises {brief(error)} when its operations are traced; write "
             "it with NumPy's functions of arrays alone"
         ) from error
+    finally:
+        RAISED.reset(before)
 
 
 # ---- replacements of functions that ignore NumPy's protocols for foreign arrays
 
 
 def _filled(original: Callable[..., np.ndarray], *args: Any, **kwargs: Any) -> Any:
-    """Does np.zeros((len(x), 3)) and the like: makes an array that traced values can be assigned to."""
+    """Does np.zeros((len(x), 3)), np.tile(row, (len(x), 1)) and the like, of plain arguments.
+
+    Makes an array that traced values can be assigned to.
+    """
     array = original(*args, **kwargs)
     if BATCH not in array.shape:
         return array
@@ -86,6 +102,10 @@ def _converted(original: Callable[..., Any], x: Any, dtype: Any = None, **kwargs
     x = _stacked(x)
     if not isinstance(x, Traced):
         return original(x, dtype, **kwargs)
+    if kwargs.keys() - {"copy"}:
+        raise Untraceable(f"uses np.{original.__name__} with {', '.join(kwargs)}")
+    if original is np.ascontiguousarray:
+        x = shared_or_copied(x, x)
     copy = original is np.array and kwargs.get("copy", True)
     return x.astype(x.dtype if dtype is None else dtype, copy=bool(copy))
 
@@ -122,8 +142,9 @@ REDUCING: dict[np.ufunc, Any] = {
     np.logical_and: np.all, np.logical_or: np.any,
 }  # fmt: skip
 OF_LISTS = (*(getattr(np, name) for name in REDUCTIONS), np.amax, np.amin, np.mean, np.prod)
+REPEATING = (np.tile, np.broadcast_to, np.repeat)
 REPLACEMENTS: dict[Any, Callable[..., Any]] = {
-    **{make: partial(_filled, make) for make in (np.empty, np.zeros, np.ones, np.full)},
+    **{make: partial(_filled, make) for make in (np.empty, np.zeros, np.ones, np.full, *REPEATING)},
     **{
         convert: partial(_converted, convert)
         for convert in (np.array, np.asarray, np.asanyarray, np.ascontiguousarray)
@@ -169,7 +190,8 @@ class _PrivateCopies:
         if isinstance(x, staticmethod | classmethod):
             return type(x)(self.copy_of(x.__func__))
         if isinstance(x, partial):
-            return partial(self.copy_of(x.func), *x.args, **x.keywords)
+            given = {name: self.copy_of(value) for name, value in x.keywords.items()}
+            return partial(self.copy_of(x.func), *map(self.copy_of, x.args), **given)
         if isinstance(x, FunctionType) and _is_copied(x.__globals__.get("__name__")):
             return self._function(x)
         if type(x).__module__.startswith("hyrl_mj."):

@@ -86,7 +86,7 @@ class Traced(NDArrayOperatorsMixin):
     def __init__(self, operation: Operation) -> None:
         self._operation = operation
         # Of which it is a part, as that was when it was taken, and what takes it.
-        self._whole: tuple[Traced, Operation, Callable[[], Traced]] | None = None
+        self._whole: tuple[Traced, Operation, Callable[[], Traced] | None] | None = None
         self._written: Traced | None = None  # the part of it that was written to
         value = operation.value
         # Operations in place change none of these.
@@ -103,12 +103,20 @@ class Traced(NDArrayOperatorsMixin):
         if self._whole is not None:
             whole, then, again = self._whole
             if whole._written is not self and whole.operation is not then:
+                if again is None:
+                    raise Untraceable(
+                        "writes to an array of which there may be a copy, as np.ravel and "
+                        "np.ascontiguousarray make of some: say x.copy()"
+                    )
                 self._operation = again().operation
                 self.part_of(whole, again)
         return self._operation
 
-    def part_of(self, whole: Traced, again: Callable[[], Traced]) -> Traced:
-        """Returns itself, as what shares its memory with another array, of which it can be taken `again`."""
+    def part_of(self, whole: Traced, again: Callable[[], Traced] | None) -> Traced:
+        """Returns itself, as what shares its memory with another array, of which it can be taken `again`.
+
+        Without that nobody knows whether it shares it: it cannot be used any more once the other is written.
+        """
         if self is not whole:
             self._whole = whole, whole._operation, again
         return self
@@ -126,6 +134,9 @@ class Traced(NDArrayOperatorsMixin):
             return apply("astype", self, dtype=name)
         return np.copy(self) if copy else self
 
+    def flatten(self) -> Any:
+        return np.copy(np.ravel(self))
+
     def reshape(self, *shape: Any, **options: Any) -> Traced:
         return _call(np.reshape, self, shape[0] if len(shape) == 1 else shape, **options)
 
@@ -136,7 +147,7 @@ class Traced(NDArrayOperatorsMixin):
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):  # NumPy looks for its own protocols
             raise AttributeError(name)
-        function = getattr(np, {"flatten": "ravel"}.get(name, name), None)
+        function = getattr(np, name, None)
         if function not in FUNCTIONS:
             raise Untraceable(f"uses .{name} of an array, which cannot be traced")
         return partial(_call, function, self)
@@ -266,11 +277,16 @@ def _reshape(x: Any, shape: Any) -> Traced:
     shape = np.reshape(x.operation.value, shape).shape
     if BATCH not in shape:
         raise Untraceable("joins the rows of a batch: each must stand for itself")
-    return (
-        x
-        if shape == x.shape
-        else apply("reshape", x, shape=shape).part_of(x, lambda: _reshape(x, shape))
-    )
+    if shape == x.shape:
+        return x
+    sizes, before = ([k for k in sizes if k != 1] for sizes in (shape, x.shape))
+    again = (lambda: _reshape(x, shape)) if sizes == before else None
+    return apply("reshape", x, shape=shape).part_of(x, again)
+
+
+def shared_or_copied(x: Traced, whole: Traced) -> Traced:
+    """Returns an array of which nobody knows whether it shares its memory with another one."""
+    return Traced(x.operation).part_of(whole, None)
 
 
 def take(x: Any, indices: Any, axis: int | None = None) -> Traced:
@@ -294,6 +310,7 @@ FUNCTIONS: dict[Any, Callable[..., Any]] = {
     np.amax: partial(_reduce, "max"),
     np.amin: partial(_reduce, "min"),
     np.reshape: _reshape,
+    np.ravel: lambda x: shared_or_copied(_reshape(x, -1), x),
     np.transpose: lambda x, axes=None: x.transpose(axes),
     np.concatenate: lambda parts, axis=0: apply(
         "concatenate", *parts, axis=axis % np.ndim(parts[0])

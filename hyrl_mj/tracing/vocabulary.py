@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextvars import ContextVar
 from functools import partial, reduce
 from typing import Any
 
@@ -24,8 +25,16 @@ UFUNCS = {*ELEMENTWISE, "cos", "arctan2", "remainder"}
 REDUCTIONS = ("sum", "max", "min", "any", "all", "argmax", "argmin")
 
 
+# Those that were raised while code is traced.
+RAISED: ContextVar[list[BaseException]] = ContextVar("raised")
+
+
 class Untraceable(BaseException):
-    """Code cannot be traced; the text completes "it ...". Code that catches its own errors lets it pass."""
+    """Code cannot be traced; the text completes "it ...". Code that catches all errors does not hide it."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        RAISED.get([]).append(self)
 
 
 def _prod(x: Any, axis: Any = None, keepdims: bool = False) -> Any:
@@ -106,7 +115,6 @@ COMPOSED: dict[Any, Callable[..., Any]] = {
     np.mean: _mean,
     np.prod: _prod,
     np.linalg.norm: _norm,
-    np.ravel: lambda x: np.reshape(x, -1),
     np.squeeze: lambda x, axis=None: np.reshape(x, np.empty(x.shape).squeeze(axis).shape),
     np.expand_dims: lambda x, axis: np.reshape(x, np.expand_dims(np.empty(x.shape), axis).shape),
     np.atleast_1d: lambda x: x,
