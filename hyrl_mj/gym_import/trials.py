@@ -50,7 +50,8 @@ def observer_of(instance: Instance) -> str:
     if not left:
         raise BadInput(
             f"{instance.name} has no method that computes what it observes in its present state, so nothing "
-            "is known of what it would observe under noise: give it one named _get_obs, without arguments"
+            "is known of what it would observe under noise: give it one named _get_obs, without arguments, "
+            "whose answer step() and reset() return as it is"
         )
     return _called(instance, left) or next(iter(left))
 
