@@ -124,7 +124,7 @@ def settings_of(env: Any) -> dict[str, bytes]:
     for name, owner, key in held(env, {}):
         numbers, rest = taken_apart(value_at(owner, key)) or (np.empty(0), None)
         with np.errstate(over="ignore"):
-            found[name] = "\n".join(_texts(rest)).encode() + numbers.astype("<f4").tobytes()
+            found[name] = ascii(_texts(rest)).encode() + numbers.astype("<f4").tobytes()
     return found
 
 

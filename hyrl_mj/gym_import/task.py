@@ -174,7 +174,7 @@ class EnvironmentTask(Task):
         env = self.specification.description.env
         digest.update(code_of(self._instance.env, env).encode())
         for name, setting in sorted(self._settings.items()):
-            digest.update(name.encode() + setting)
+            digest.update(ascii(name).encode() + setting)
         return digest.hexdigest()
 
     @property
