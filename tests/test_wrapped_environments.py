@@ -535,6 +535,7 @@ def test_an_end_at_the_goal_is_an_arrival_and_a_collision_is_none(make, success)
         (Colliding, {"success": "terminated"}, "touches what it does not touch elsewhere"),
         (Puck, {"success": 'info["won"]'}, "that word: name an entry of info; it has had success"),
         (Puck, {"failure": 'info["success"]'}, "it is a success .* and a failure"),
+        (type("Solved", (Puck,), {"arrived": lambda *_: True}), {}, "Solved is a success after its first"),
         (
             lambda: RecordEpisodeStatistics(Puck()), {"success": 'info["episode"]["r"] > 0'},
             "runs are played without RecordEpisodeStatistics, so say it by reward",
