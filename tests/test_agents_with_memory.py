@@ -457,6 +457,12 @@ def test_what_it_lacks_is_said(circle):
         def predict(self, *args, **kwargs):
             return super().predict(*args, **kwargs)[0], np.zeros(1)
 
+    class Plain:
+        def predict(self, observation):
+            return turn(observation)
+
+    with pytest.raises(BadInput, match=r"as that of SB3: give .* lambda o: model\.predict\(o\)"):
+        from_callable(Plain(), circle)
     with pytest.raises(
         BadInput, match=r"act\(\) gives no pair: give the inputs and the next memory"
     ):

@@ -40,8 +40,9 @@ from planted import spare_environments, without_judges, without_pictures
 import hyrl_mj
 from hyrl_mj import BadInput, Outcome, from_gymnasium, get_task, simulate
 from hyrl_mj.gym_import import inspection, making
+from hyrl_mj.gym_import.attributes import settings_of
 from hyrl_mj.gym_import.coordinates import coordinates
-from hyrl_mj.gym_import.fingerprint import of_model
+from hyrl_mj.gym_import.fingerprint import code_of, of_model
 from hyrl_mj.gym_import.instance import Instance, flat
 from hyrl_mj.gym_import.opening import Description
 from hyrl_mj.gym_import.specification import EnvironmentSpec
@@ -455,7 +456,11 @@ def test_what_resets_draw_is_pinned_by_a_seed_or_by_options_that_they_heed():
 def test_the_code_of_an_environment_is_that_of_its_files(tmp_path, monkeypatch, puck):
     monkeypatch.syspath_prepend(tmp_path)
     path = tmp_path / "my_puck.py"
-    path.write_text("from environments import Puck\nclass Mine(Puck):\n    push = 1\n")
+    path.write_text(
+        "import my_rules\nfrom environments import Puck\nclass Mine(Puck):\n    push = 1\n"
+    )
+    beside = tmp_path / "my_rules.py"
+    beside.write_text("")
     module = importlib.import_module("my_puck")
 
     def code():
@@ -469,8 +474,32 @@ def test_the_code_of_an_environment_is_that_of_its_files(tmp_path, monkeypatch, 
     path.write_text(path.read_text() + "# changed\n")
     assert code() == codes[1], "it has not been imported again"
     monkeypatch.setattr(puck._instance, "env", importlib.reload(module).Mine())
-    assert len({*codes, code()}) == 3
+    codes.append(code())
+    beside.write_text("crashed = 1\n")
+    monkeypatch.setattr(puck._instance, "env", importlib.reload(module).Mine())
+    codes.append(code())
+    # What it reads from files of its own shows in what it holds; an object of a notebook is of no file.
+    monkeypatch.setattr(puck, "_settings", settings_of(module.Mine()) | {"radius": b"0.05"})
+    codes.append(code())
+    assert len({*codes}) == len(codes) == 5
     del puck.code
+
+
+def test_settings_and_the_code_of_a_notebook_are_written_down_for_each_process():
+    def of(radius, text="return False"):
+        """As a cell of a notebook makes it."""
+        names = {"Puck": Puck, "__name__": "a_notebook"}
+        exec(f"class Cell(Puck):\n def crashed(self): {text}", names)
+        env = names["Cell"]()
+        env.config = {"radius": radius, "of": "here", "file": "/a/map.npy"}
+        return settings_of(env), code_of(env, lambda: radius)
+
+    one, other = of(0.25), of(0.05)
+    assert [name for name in one[0] if one[0][name] != other[0][name]] == ["attribute config"]
+    assert b"here" in one[0]["attribute config"]
+    assert b"map" not in one[0]["attribute config"]
+    assert one == of(0.25)
+    assert one[1] == other[1] != of(0.25, "return True")[1]
 
 
 def test_a_free_joint_has_places_that_a_chart_may_name_but_no_orientation():

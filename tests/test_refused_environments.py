@@ -531,6 +531,13 @@ OBSERVED = {
 # ---- what is drawn, or outlasts resets
 
 
+class Hasty(Puck):
+    """Its motors go by the clock of the machine."""
+
+    def control(self, action):
+        super().control(action * (1 + 1e-3 * np.sin(time.time())))
+
+
 class Site(Puck):
     """Each reset draws a goal, and puts a site there."""
 
@@ -682,6 +689,7 @@ DRAWN = {
     "activations": (
         Lagging, {}, f"Lagging changes .* {OUTLASTS.format(ACT)}.* mj_resetData",
     ),
+    "the clock": (Hasty, {}, "two new environments Hasty go apart .* depends on the clock"),
     "in turn": (InTurn, {}, f"changes from .* {OUTLASTS.format('.*turn')}"),
     "statistics": (normalised, {}, "outlasts .*obs_rms.*set update_running_mean = False"),
     "a hidden count": (lambda: Secret(Puck()), {}, EPISODE.format("Secret.*scale.count")),
@@ -821,6 +829,20 @@ class Latching(Flat):
         return super()._get_obs() + 0.1 * self.docked
 
 
+class Watching(Flat):
+    """Its observer notes whether it has been near the rock, and that ends an episode."""
+
+    def begin(self, place):
+        self.near = False
+
+    def _get_obs(self):
+        self.near = self.near or bool(np.abs(self.data.qpos).max() < 0.72)
+        return super()._get_obs()
+
+    def crashed(self):
+        return self.near
+
+
 class Flagged(Flat):
     """All of its instances share a flag, which a reset lowers and a place far to the right raises."""
 
@@ -845,6 +867,7 @@ IN_RUNS = {
     "a judge of sides": (lambda: Picky, None, EVER.format("side")),
     "a denied place": (lambda: Denied, 0.15, r"has observed 0\.\d in .* gives .* in the same state"),
     "an observer that remembers": (lambda: Latching, 0.3, r"docked|in the same state|differs by"),
+    "an observer that judges": (lambda: Watching, 0.3, r"without the noise.* _get_obs\(\) has noted"),
     "a flag of all": (lambda: Flagged, 0.0, r"class Flagged\.raised, which all its instances share"),
 }  # fmt: skip
 
@@ -856,6 +879,7 @@ IN_RUNS = {
         "a judge of many wins",
         "a denied place",
         "an observer that remembers",
+        "an observer that judges",
         "a flag of all",
         *map(later, ("a curriculum in a bound method", "a curriculum in the module")),
         *map(later, ("a judge of resets without a seed", "a judge of sides")),
@@ -966,9 +990,10 @@ def test_a_slow_reset_is_refused(monkeypatch):
 
 def test_a_slow_environment_is_said_to_take_minutes(caplog):
     slow = type("Slow", (Puck,), {"after": lambda self: time.sleep(0.03)})
-    for kind in (Puck, slow):
-        inspection._check_times(Instance(EnvironmentSpec(Description(kind))))
+    for kind, making in ((Puck, 0.1), (slow, 0.1), (Puck, 1.0)):
+        inspection._check_times(Instance(EnvironmentSpec(Description(kind))), making)
     assert [re.sub(r"\d+", "N", text) for text in caplog.messages] == [
-        "Slow takes N ms for a reset and N ms for a step: to look at it, before anything else, takes about N "
-        "minute(s)"
+        f"{name} takes N ms to be made, N ms for a reset and N ms for a step: to look at it, before anything "
+        "else, takes about N minute(s)"
+        for name in ("Slow", "Puck")
     ]

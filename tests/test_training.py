@@ -72,7 +72,7 @@ def test_dqn_learns_the_vehicle_with_some_more_samples(vehicle):
 
 @pytest.mark.first(1)
 @pytest.mark.slow
-def test_the_seed_fixes_every_weight_whatever_the_threads_of_the_physics(
+def test_the_seed_fixes_every_weight_whatever_threads_and_torch_are_set_to(
     task, quick, tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
@@ -82,8 +82,15 @@ def test_the_seed_fixes_every_weight_whatever_the_threads_of_the_physics(
     for threads, seed in ((1, 4), (2, 4), (2, 5)):
         monkeypatch.setattr(training, "BatchedEnv", partial(BatchedEnv, threads=threads))
         policies.append(training.train(task, quick, seed=seed, ground=noisy))
-    first, again, other = policies
+    torch.set_default_dtype(torch.float64)  # as code of the user's may have set it for itself
+    try:
+        with torch.inference_mode():
+            policies.append(training.train(task, quick, seed=5, ground=noisy))
+    finally:
+        torch.set_default_dtype(torch.float32)
+    first, again, other, unset = policies
     assert_same_weights(first, again)
+    assert_same_weights(other, unset)
     assert any(not np.array_equal(first.weights[n], other.weights[n]) for n in first.weights)
     assert not any(tmp_path.iterdir()), "without a folder for logs none are written"
 

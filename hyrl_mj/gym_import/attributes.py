@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copyreg
+import os
 import pickle
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Set
@@ -111,6 +112,27 @@ def _rest(value: Any, numbers: list[np.ndarray]) -> Any:
     if has_more or hasattr(value, "__dict__") or has_no_memory(value):
         raise TypeError("it is more than a value")
     return value if isinstance(value, str | bytes | None) else pickle.dumps(value)
+
+
+def settings_of(env: Any) -> dict[str, bytes]:
+    """Returns the numbers and texts that attributes of an environment and its wrappers hold, by name.
+
+    They are written down to be compared, also on another machine: numbers are rounded, and names of files
+    are left out.
+    """
+    found = {}
+    for name, owner, key in held(env, {}):
+        numbers, rest = taken_apart(value_at(owner, key)) or (np.empty(0), None)
+        with np.errstate(over="ignore"):
+            found[name] = ascii(_texts(rest)).encode() + numbers.astype("<f4").tobytes()
+    return found
+
+
+def _texts(rest: Any) -> list[str]:
+    """Returns the texts in what is left of a value, but for names of files."""
+    if isinstance(rest, str):
+        return [] if os.sep in rest else [rest]
+    return [t for part in rest for t in _texts(part)] if isinstance(rest, list | tuple) else []
 
 
 def numbers_of(value: Any) -> np.ndarray | None:

@@ -87,6 +87,13 @@ def _drawn(instance: Instance, resets: Resets) -> list[str]:
             f"{instance.name} draws random numbers in reset(), from a generator that its seed does not "
             f"decide ({min(own)}): let it draw from self.np_random"
         )
+    one, other = (_begun(Instance(instance.spec), states[:1], 0)[1] for _ in range(2))
+    if not np.array_equal(one, other, equal_nan=True):
+        raise BadInput(
+            f"two new environments {instance.name} go apart after a reset with the same seed, under the same "
+            "inputs: it depends on the clock, on threads, or on chance that no seed decides, so let it "
+            "compute with the time of MuJoCo, and draw from self.np_random in its reset"
+        )
     begun = [
         _begun(
             Instance(instance.spec) if lasting else instance,

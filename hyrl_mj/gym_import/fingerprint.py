@@ -8,6 +8,7 @@ never set: pickles of them are written, and none is read.
 from __future__ import annotations
 
 import copyreg
+import inspect
 import marshal
 import os
 import pickle
@@ -19,6 +20,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, partial
 from operator import attrgetter
+from pathlib import Path
 from types import BuiltinFunctionType, CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
 
@@ -27,6 +29,8 @@ import mujoco
 import numpy as np
 from gymnasium import spaces
 
+from hyrl_mj.files import sources
+from hyrl_mj.files.artifacts import digest
 from hyrl_mj.gym_import.opening import layers
 from hyrl_mj.gym_import.physics import Physics, parts_of_model
 
@@ -308,6 +312,37 @@ def codes_of(kind: type) -> list[CodeType]:
 def _with_inner(code: CodeType) -> list[CodeType]:
     parts = [part for part in code.co_consts if isinstance(part, CodeType)]
     return [code, *(inner for part in parts for inner in _with_inner(part))]
+
+
+def code_of(env: gym.Env, make: Any) -> str:
+    """Returns a text of the code that defines an environment, its wrappers, a task of dm_control, and what
+    makes it: SHA-256 of files, or what Python has compiled.
+    """
+    control = getattr(env.unwrapped, "_env", None)
+    parts = (*layers(env), control, getattr(control, "task", None))
+    found = {_code_of(kind) for part in parts for kind in type(part).__mro__}
+    code = getattr(make, "__code__", None)
+    return "".join(sorted(found)) + (_compiled(code) if code is not None else "")
+
+
+@cache  # Python imports a file once, so what has become of it since is not what runs
+def _code_of(kind: type) -> str:
+    """Returns the SHA-256 of the file that defines a class, one of the user's with those beside it."""
+    own = kind.__module__.partition(".")[0] not in LIBRARIES
+    try:
+        return (sources.digest_of if own else digest)(Path(inspect.getfile(kind)))
+    except (TypeError, OSError):  # it is built in, or of a notebook
+        return "".join(map(_compiled, codes_of(kind))) if own else ""
+
+
+def _compiled(code: CodeType) -> str:
+    """Returns a text of compiled code, the same in each process."""
+    consts = [
+        _compiled(one) if isinstance(one, CodeType)
+        else sorted(map(repr, one)) if isinstance(one, frozenset) else repr(one)
+        for one in code.co_consts
+    ]  # fmt: skip
+    return f"{code.co_code.hex()} {code.co_names} {consts}"
 
 
 @cache

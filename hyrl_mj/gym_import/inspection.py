@@ -44,9 +44,9 @@ from hyrl_mj.gym_import.uses import check_copied, check_told, check_use, senses
 from hyrl_mj.physics import memory, mjcf
 from hyrl_mj.sets import Chart
 
-# Resets and steps of an inspection, about (without wrappers half as many resets), and from how long on it is
-# said how long it takes [s].
-TAKEN, LONG = (750, 12_000), 60.0
+# Resets and steps of an inspection, and environments that are made, about (without wrappers half as many
+# resets), and from how long on it is said how long it takes [s].
+TAKEN, LONG = (750, 12_000, 100), 60.0
 # Runs under inputs at random that show what an environment does at all, and their samples at most.
 RUNS, LENGTH = 16, 150
 # What is said of an observation that shows derived quantities from before the end of a step.
@@ -74,13 +74,13 @@ def inspect(description: Description, untried: bool = False) -> tuple[Pool, Inst
             f"{description.name} comes from a file of others, and this process cannot fork another one that "
             "tries it within limits of time and memory: open it once in the main process of a program"
         )
-    instance = Instance(pool.spec)
+    instance, began = Instance(pool.spec), time.monotonic()
     if made(description).unwrapped is instance.inner:
         raise BadInput(
             f"{description.name} gives the same environment each time, and episodes are played by several: "
             "let it make a new one"
         )
-    _check_times(instance)
+    _check_times(instance, time.monotonic() - began)
     _check_pinned(instance)
     instance.reset()
     _learn_spaces(instance)
@@ -122,8 +122,11 @@ def inspect(description: Description, untried: bool = False) -> tuple[Pool, Inst
     return pool, instance
 
 
-def _check_times(instance: Instance) -> None:
-    """Raises `BadInput` if a reset or a step takes so long that runs would take hours; says so of minutes."""
+def _check_times(instance: Instance, making: float) -> None:
+    """Raises `BadInput` if a reset or a step takes so long that runs would take hours; says so of minutes.
+
+    To make one takes `making` [s].
+    """
     u = instance.drawn(np.random.default_rng(0))
     works = (
         ("reset", 3.0, "each of thousands of episodes begins with it", instance.reset),
@@ -140,11 +143,12 @@ def _check_times(instance: Instance) -> None:
                     f"{name}() of {instance.name} takes {least[i]:.1f} s, and {why}: give an environment "
                     f"whose {name} takes less than {most:g} s"
                 )
-        if (spent := np.dot(least, TAKEN)) < LONG:
+        if (spent := np.dot([*least, making], TAKEN)) < LONG:
             return
     logging.getLogger("hyrl_mj").warning(
-        f"{instance.name} takes {1e3 * least[0]:.0f} ms for a reset and {1e3 * least[1]:.0f} ms for a step: "
-        f"to look at it, before anything else, takes about {spent / 60:.0f} minute(s)"
+        f"{instance.name} takes {1e3 * making:.0f} ms to be made, {1e3 * least[0]:.0f} ms for a reset and "
+        f"{1e3 * least[1]:.0f} ms for a step: to look at it, before anything else, takes about "
+        f"{spent / 60:.0f} minute(s)"
     )
 
 

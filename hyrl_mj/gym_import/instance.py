@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+import mujoco
 import numpy as np
 from gymnasium import spaces
 
@@ -114,7 +115,7 @@ class Instance:
         self.draws_globally = self._at_start = self._was_reset = False
         self.own: np.ndarray | None = None
         self._samples = 0
-        self._pairs: list[tuple[np.ndarray, np.ndarray]] = []
+        self._placed: mujoco.MjData | None = None
         self.tamper: Callable[[tuple[Any, ...]], tuple[Any, ...]] | None = None
         self.noted: Callable[[], None] | None = None
         self.follow: Any = None
@@ -177,11 +178,6 @@ class Instance:
                 "it keep its model"
             )
         self.data = self.physics.data = physics[1]
-        # Views of MuJoCo's data, which show where these are at any time.
-        self._pairs = [
-            (getattr(self.data, a)[i], getattr(self.data, b)[j])
-            for (a, i), (b, j) in self.spec.criterion.points
-        ]
         if not self.is_wrapped:
             self.inner_seen = observation
         if self.start is None and not plain:
@@ -605,8 +601,14 @@ class Instance:
         )
         report = [reward, bool(terminated), bool(truncated), touch]
         report += [entry(info, key) for key in self.spec.criterion.keys]
-        for a, b in self._pairs:
-            away = a - b
+        if self.spec.criterion.points:
+            # Where things are now: the environment's own data may show a physics step before.
+            self._placed = self._placed or mujoco.MjData(self.model)
+            for part in ("qpos", "mocap_pos", "mocap_quat"):
+                getattr(self._placed, part)[:] = getattr(self.data, part)
+            mujoco.mj_kinematics(self.model, self._placed)
+        for (a, i), (b, j) in self.spec.criterion.points:
+            away = getattr(self._placed, a)[i] - getattr(self._placed, b)[j]
             report.append(math.sqrt(away.dot(away)))
         self.report = report
 

@@ -5,14 +5,12 @@ from __future__ import annotations
 import copy
 import importlib
 import importlib.util
-import inspect
 import io
 import traceback
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import nullcontext, redirect_stderr, suppress
 from dataclasses import dataclass, field
 from difflib import get_close_matches
-from functools import cache
 from numbers import Real
 from pathlib import Path
 from typing import Any
@@ -23,7 +21,6 @@ import numpy as np
 from gymnasium import spaces
 
 from hyrl_mj.errors import BadInput, brief, check_seed
-from hyrl_mj.files.artifacts import digest
 from hyrl_mj.files.trust import current_folder, only_installed
 from hyrl_mj.gym_import.observations import parts_of
 from hyrl_mj.physics import mjcf, mujoco_log
@@ -266,7 +263,7 @@ def _checked(env: Any, name: str) -> mujoco.MjModel:
     if physics is None:
         raise BadInput(
             f"{name} is not simulated by MuJoCo, as far as its attributes model and data tell: give an "
-            "environment of MuJoCo"
+            "environment of MuJoCo, which has its MjModel and its MjData under these names when it is made"
         )
     for part in parts_of(env.observation_space).values():
         rows = 2 if part.dtype == np.uint8 else 3
@@ -327,21 +324,6 @@ def layers(env: gym.Env) -> list[Any]:
     while isinstance(found[-1], gym.Wrapper):
         found.append(found[-1].env)
     return found
-
-
-def code_of(env: gym.Env) -> list[str]:
-    """Returns the SHA-256 of the files that define an environment, its wrappers, and a task of dm_control."""
-    control = getattr(env.unwrapped, "_env", None)
-    parts = (*layers(env), control, getattr(control, "task", None))
-    return sorted({_digest_of(kind) for part in parts for kind in type(part).__mro__})
-
-
-@cache  # Python imports a file once, so what has become of it since is not what runs
-def _digest_of(kind: type) -> str:
-    """Returns the SHA-256 of the file that defines a class; "" if no file does."""
-    with suppress(TypeError, OSError):
-        return digest(Path(inspect.getfile(kind)))
-    return ""
 
 
 def physics_of(env: gym.Env) -> tuple[mujoco.MjModel, mujoco.MjData] | None:

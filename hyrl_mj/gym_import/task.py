@@ -12,10 +12,10 @@ import mujoco
 import numpy as np
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.gym_import.fingerprint import differing, is_shared, of_model
+from hyrl_mj.gym_import.attributes import settings_of
+from hyrl_mj.gym_import.fingerprint import code_of, differing, is_shared, of_model
 from hyrl_mj.gym_import.instance import Instance
 from hyrl_mj.gym_import.observations import parts_of
-from hyrl_mj.gym_import.opening import code_of
 from hyrl_mj.gym_import.plant import EnvironmentPlant
 from hyrl_mj.gym_import.pool import Pool
 from hyrl_mj.gym_import.stage import Played
@@ -54,6 +54,10 @@ class EnvironmentTask(Task):
         self.specification = specification = pool.spec
         self._pool, self._instance, self.made_of = pool, instance, made_of
         self.model, self._memory = instance.model, instance.memory()
+        twin, own = Instance(pool.spec), settings_of(instance.env)
+        twin.reset()
+        # Of any two some are others, such as the time when they were made.
+        self._settings = dict(own.items() & settings_of(twin.env).items())
         # What a task and a specification call alike.
         for name in (
             "name", "chart", "inputs", "start_low", "start_high", "max_steps", "dt", "worst_reward",
@@ -84,10 +88,12 @@ class EnvironmentTask(Task):
         self._set_scene(specification.tracked)
 
     def is_as_made(self) -> bool:
-        """Returns whether a new environment has the model, and shares with others, what it had at first."""
+        """Returns whether a new environment has the model, the settings, and what is shared, as at first."""
         new = Instance(self.specification)
         new.reset()
         changed = differing(new.memory(), self._memory)
+        if self._settings.items() - settings_of(new.env).items():
+            return False
         return not any(is_shared(name) or name.endswith(" of its model") for name in changed)
 
     def __reduce__(self) -> tuple[Callable[..., Task], tuple[Any, ...]]:
@@ -165,7 +171,10 @@ class EnvironmentTask(Task):
     @cached_property
     def code(self) -> str:
         digest = sha256(b"".join(of_model(self.model).values()))
-        digest.update("".join(code_of(self._instance.env)).encode())
+        env = self.specification.description.env
+        digest.update(code_of(self._instance.env, env).encode())
+        for name, setting in sorted(self._settings.items()):
+            digest.update(ascii(name).encode() + setting)
         return digest.hexdigest()
 
     @property

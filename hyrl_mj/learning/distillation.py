@@ -7,7 +7,7 @@ import torch
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.learning.settings import Training
-from hyrl_mj.learning.training import build, export, threads
+from hyrl_mj.learning.training import build, export, threads, usual_torch
 from hyrl_mj.policies import ALGORITHMS, MlpPolicy, Policy
 from hyrl_mj.system.progress import progress_bar
 from hyrl_mj.tasks import Task
@@ -27,6 +27,7 @@ def fits(task: Task, settings: Training, policy: MlpPolicy) -> bool:
     return True
 
 
+@usual_torch()
 def distil(task: Task, policy: Policy, starts: Starts, settings: Training, seed: int) -> MlpPolicy:
     """Returns a network that imitates a policy, by regression; PPO and A2C can continue from it.
 

@@ -63,6 +63,19 @@ class Ground(Protocol):
         """Returns the score of a policy; higher is better, compared from left to right."""
 
 
+@contextmanager
+def usual_torch() -> Iterator[None]:
+    """Lets torch compute with 32 bits and gradients, whatever a user's code has set for itself."""
+    kind = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float32)
+    try:
+        with torch.inference_mode(False), torch.enable_grad():
+            yield
+    finally:
+        torch.set_default_dtype(kind)
+
+
+@usual_torch()
 def train(
     task: Task,
     settings: Training,
@@ -109,6 +122,7 @@ def train(
     return watch.best
 
 
+@usual_torch()
 def build(
     task: Task,
     settings: Training,

@@ -213,7 +213,10 @@ def _predicting(model: Predicts, task: Task) -> FunctionPolicy | RememberingPoli
     try:
         _, state = model.predict(seen(observation), None, episode_start=begins, deterministic=True)
     except Exception as error:  # a user's code can raise anything
-        raise BadInput(f"predict() of {model!r:.80} raised {brief(error)}") from error
+        raise BadInput(
+            f"predict() of {model!r:.80} raised {brief(error)}, where it is called as that of SB3: give a "
+            "function that calls it, as lambda o: model.predict(o)"
+        ) from error
     if state is None:
         return FunctionPolicy(
             task, lambda o: model.predict(seen(o), deterministic=True)[0], "the model"
