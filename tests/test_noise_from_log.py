@@ -427,3 +427,12 @@ def test_a_log_is_of_columns_that_are_those_of_the_chart(tmp_path, monkeypatch):
 def write_theta(folder, log):
     """Writes a log of theta."""
     return write(folder / "log.csv", {k.replace("x", "theta"): v for k, v in log.items()})
+
+
+@pytest.mark.parametrize("gaussian", [0.0, 0.03])
+def test_samples_that_the_noise_told_cannot_show_are_told(gaussian, of):
+    """Beside a quantum the tails of a sum of uniform and normal noise are taken for uniform noise."""
+    kinds = {"uniform": 0.05, "delay": 2, "hold": (2, 0.2), "quantum": 0.01}
+    found = of(planted(10, 0.05, seconds=200, gaussian=gaussian, **kinds))
+    told = f"% of the samples of x are beyond what {found.text} can show"
+    assert any(told in remark for remark in found.remarks) == bool(gaussian)

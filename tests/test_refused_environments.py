@@ -985,7 +985,7 @@ def test_a_slow_reset_is_refused(monkeypatch):
     clock = SimpleNamespace(monotonic=itertools.count(0, 3.2).__next__)
     monkeypatch.setattr(inspection, "time", clock)
     with pytest.raises(BadInput, match=r"reset\(\) of Puck takes 3\.2 s"):
-        inspection._check_times(Instance(EnvironmentSpec(Description(Puck))))
+        inspection._check_times(Instance(EnvironmentSpec(Description(Puck))), 0.1)
 
 
 def test_a_slow_environment_is_said_to_take_minutes(caplog):

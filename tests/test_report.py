@@ -71,7 +71,7 @@ def plant(path, task, critical, partition, slack=0.2, **settings):
     write_config(run)
     with run.manifest.stage("train"):
         linear(task, 0.0).save(path / "policy.safetensors")
-        Arrivals(990, 0, 1_000).save(path / "arrivals.json")
+        Arrivals(990, 0, 1_000, trainings=1).save(path / "arrivals.json")
     with run.manifest.stage("critical-set"):
         critical.save(path / "critical_set.npz")
     with run.manifest.stage("partition"):

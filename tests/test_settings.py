@@ -112,7 +112,9 @@ OF_TRAININGS = {
     "rehearse_deciding": ([-0.1, 0.7, NAN], "a number from 0 to 1|together give at most 1"),
     "warm_start": ([0, None], "True or False"),
     "episode": ([0, -3, 2.5, True], "an integer from 1 to"),
+    "shaped": ([0, None], "True or False"),
     "attempts": ([0, 1.5, 10**6], "an integer from 1 to"),
+    "minutes": ([-1, NAN, "3", 10**6], "a number from 0 to"),
     "action_noise": ([-1, NAN, 11, 0.1], "action_noise"),
     "options": ([None, 5, ["n_steps"]], "a dictionary"),
 }

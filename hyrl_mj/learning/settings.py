@@ -28,6 +28,8 @@ PRESETS = ("fast", "paper", "smoke")
 # Grid cells along the longest side of a chart.
 CELLS = Integer(2, 10**6)
 _SHARE = Number(0, 1)
+# Samples of a training, and widths of its layers, at most.
+MOST, WIDEST = 10**9, 4_096
 # Share of the episodes that start anywhere, of trainings that learn a scene that nobody has tuned them for.
 REHEARSED = 0.4
 
@@ -190,9 +192,9 @@ class Training(Checked):
     """
 
     algorithm: Annotated[str, Text()]
-    samples: Annotated[int, Integer(1, 10**9)]
+    samples: Annotated[int, Integer(1, MOST)]
     envs: Annotated[int, Integer(1, 2**16)]
-    hidden: Annotated[tuple[int, ...], Several(Integer(1, 4_096), 1, 16)]
+    hidden: Annotated[tuple[int, ...], Several(Integer(1, WIDEST), 1, 16)]
     activation: Annotated[str, OneOf(ACTIVATIONS)]
     learning_rate: Annotated[float, Number(0, 1, above=True)]
     anneal: Annotated[bool, Flag()]
@@ -232,7 +234,7 @@ class Training(Checked):
         """Returns the settings of an attempt of stage 1, from 0 on; see `attempts`."""
         if not number:
             return self
-        more = 1 if number == 1 else 2
+        more = 1 if number == 1 or self.samples > MOST // 2 or max(self.hidden) > WIDEST // 2 else 2
         return replace(
             self,
             shaped=True,

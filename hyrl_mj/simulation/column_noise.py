@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import nan
 
 import numpy as np
@@ -167,7 +167,7 @@ def column_noise(
         remarks.append(f"some samples of {name} are beyond the bound, up to {over:.3g}")
     bias = nan if r is None else float(sum(np.quantile(slow, ENDS)) / 2)
     unsure_bias = max(3 * sigma / np.sqrt(used.sum()), drift / 20, quantum / 20)
-    return ColumnNoise(
+    found = ColumnNoise(
         name,
         delay=delay,
         held=held,
@@ -181,12 +181,41 @@ def column_noise(
         sigma=sigma,
         uniform=uniform,
         correlation=float(correlations[1]),
-        remarks=tuple(remarks),
         times=t[used],
         errors=raw[used],
         slow=slow[used],
         correlations=correlations,
     )
+    return replace(found, remarks=(*remarks, *_beyond(found, y, late, turn, share, tiny)))
+
+
+def _beyond(
+    found: ColumnNoise, y: np.ndarray, late: np.ndarray, turn: float, share: float, tiny: float
+) -> list[str]:
+    """Returns a remark if more of the measurements than the share allows are none that the noise could show.
+
+    Args:
+        found: the noise that is told.
+        y: (n,) measurements, NaN in gaps.
+        late: (n,) delayed reference.
+        turn, share: as in `column_noise`.
+        tiny: the rounding of floats.
+    """
+    from scipy import stats
+
+    reach = found.bound + found.told_bias + found.drift + found.quantum / 2
+    away = np.full(len(y), np.inf)  # one that was held may be that of any sample so long before
+    for lag in range(found.held + 1):
+        away = np.fmin(away, np.abs(_short(y - _shifted(late, lag), turn)))
+    away = away[np.isfinite(away)]
+    # A twentieth is what smoothing leaves.
+    beyond = int((away > 1.05 * reach + tiny).sum())
+    if not beyond or stats.binomtest(beyond, len(away), 1 - share, "greater").pvalue > CHANCE:
+        return []
+    return [
+        f"{100 * beyond / len(away):.2g}% of the samples of {found.name} are beyond what {found.text} can "
+        f"show, which is {reach:.3g}; the largest error is {away.max():.3g}: give a larger bound"
+    ]
 
 
 def _short(difference: np.ndarray, turn: float) -> np.ndarray:

@@ -58,7 +58,7 @@ class Material:
         write_config(run)
         with run.manifest.stage("train"):
             ahead.save(path / "policy.safetensors")
-            Arrivals(990, 0, 1_000).save(path / "arrivals.json")
+            Arrivals(990, 0, 1_000, trainings=1).save(path / "arrivals.json")
         with run.manifest.stage("extended-sets"):
             grid = Grid.with_cells(task.chart, 4)
             inside = np.ones(len(grid.nodes), dtype=bool)
