@@ -176,8 +176,8 @@ def planted_circle(made_once):
 
 
 @pytest.fixture(scope="module")
-def small_runs():
-    """While the tests of a file run, runs of preset smoke are shorter still."""
+def small_runs(planted_circle):
+    """While the tests of a file run, runs of preset smoke are shorter still, but for the planted one."""
     from planted import shorten
 
     with pytest.MonkeyPatch.context() as patch:

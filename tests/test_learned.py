@@ -8,7 +8,7 @@ import pytest
 
 import hyrl_mj
 from hyrl_mj.errors import HyrlError
-from hyrl_mj.gym_export import BatchedEnv
+from hyrl_mj.gym_export import BatchedEnv, Domain
 from hyrl_mj.judging import Arrivals, failures
 from hyrl_mj.learning import training
 from hyrl_mj.learning.to_go import NoWay, WayToGo
@@ -70,7 +70,9 @@ def test_another_attempt_is_paid_for_the_way_to_the_goal_if_there_is_time(
     settings = settings_of(hyrl_mj.get_task("gaps"), options)
     with opened(tmp_path / "run", settings) as run:
         found = run_stage(run, "train", said.append).arrivals
-    assert (found.trainings, found.arrived) == (trainings, 900 if trainings == 2 else 0)
+    again = trainings == 2
+    assert (found.trainings, found.arrived) == (trainings, 900 if again else 0)
+    assert found.shaped == again, "which the trainings of the modes follow"
     first, *later = given
     assert first == (False, settings.stage1.samples, 0.4, 0)
     assert [attempt[:3] for attempt in later] == [(True, *first[1:3])] * (trainings - 1)
@@ -84,19 +86,28 @@ def test_another_attempt_is_paid_for_the_way_to_the_goal_if_there_is_time(
 
 def test_who_is_paid_for_the_way_to_the_goal_gets_more_beside_a_post_than_before_it():
     gaps = hyrl_mj.get_task("gaps")
-    domain = WayToGo(gaps).domain(gaps.starts, gamma=0.9)
+    pay = WayToGo(gaps, gamma=0.9).pay
     before, beside, beyond = np.array([[1.3, 0.0], [1.3, 0.5], [2.1, 0.0]])  # a post, and a gap
-    far, near, nearer = domain.reward(np.array([before, beside, beyond]))
+    still = np.zeros((3, 1))
+    far, near, nearer = pay.reward(gaps.at(np.array([before, beside, beyond])), still)
     assert 0 < far < near - 0.02 < nearer - 0.2
-    assert domain.reward(np.array([gaps.set_point])) == pytest.approx(1)
-    env = BatchedEnv(gaps, 3, domain=domain)
+    arrived = pay.reward(gaps.at(np.array([gaps.set_point])), still[:1])
+    assert arrived == pytest.approx(1 / (1 - 0.9)), "as much as to stay there for ever"
+    env = BatchedEnv(gaps, 3, domain=Domain(gaps.starts, pay=pay))
     env.reset(z=np.array([before, beside, beyond]))
-    paid = env.step(np.zeros((3, 1)))
-    assert paid.reward == pytest.approx(domain.reward(env.z))
+    paid = env.step(still)
+    assert paid.reward == pytest.approx(pay.reward(gaps.at(env.z), still))
     while not paid.terminated[0]:
-        paid = env.step(np.zeros((3, 1)))
+        paid = env.step(still)
     assert paid.outcome[0] == Outcome.CRASHED
-    assert paid.reward[0] == 0 < paid.reward[1]
+    assert paid.reward[0] == pay.worst == 0 < paid.reward[1]
+
+
+def test_who_is_paid_in_a_set_gets_nothing_for_ways_that_leave_it():
+    gaps = hyrl_mj.get_task("gaps")
+    left = WayToGo(gaps, 0.9, inside=lambda z: z[:, 1] > 0).pay
+    above, below = (gaps.at(np.array([[0.5, y]])) for y in (0.3, -0.3))
+    assert left.reward(above, np.zeros((1, 1))) > 0.1 > left.reward(below, np.zeros((1, 1))) == 0
 
 
 def test_a_goal_that_no_way_leads_to_is_told():
@@ -109,7 +120,7 @@ def test_a_goal_that_no_way_leads_to_is_told():
     with pytest.raises(
         NoWay, match=r"no way leads from its starts to its goal on .* nodes of the chart"
     ):
-        WayToGo(Walled())
+        WayToGo(Walled(), 0.9)
 
 
 def test_how_episodes_fail_is_counted(vehicle):

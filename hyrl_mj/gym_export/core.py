@@ -19,6 +19,19 @@ MOST = 2**20
 
 
 @dataclass(frozen=True)
+class Pay:
+    """What episodes are paid for.
+
+    Attributes:
+        reward: rewards (n,) of measurements (n, p) and inputs (n, m), as `Task.reward`.
+        worst: a lower bound of them.
+    """
+
+    reward: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    worst: float
+
+
+@dataclass(frozen=True)
 class Domain:
     """Where the episodes of a training start, and to which part of the state space they are restricted.
 
@@ -28,11 +41,10 @@ class Domain:
         starts: draws n chart points (n, d) with a generator.
         contains: (n, d) -> (n,) bool; an episode ends where it leaves the domain. By default it may go
             anywhere.
-        exit_reward: with `contains` or `reward`, reward for leaving the domain, and for failing in it.
+        exit_reward: with `contains`, reward for leaving the domain, and for failing in it.
         caution: (p,) largest error of a measurement: if given, the reward is `cautious_reward`.
-        earns: (n, d) -> (n,) bool; elsewhere every step is worth the task's worst reward.
-        reward: (n, d) -> (n,) in place of the task's.
-        arrival_reward: with `reward`, that of a step which ends the episode at the goal.
+        earns: (n, d) -> (n,) bool; elsewhere every step is worth the worst reward.
+        pay: what is paid for; by default the task's reward.
     """
 
     starts: Callable[[int, np.random.Generator], np.ndarray]
@@ -40,8 +52,7 @@ class Domain:
     exit_reward: float = 0.0
     caution: np.ndarray | None = None
     earns: Callable[[np.ndarray], np.ndarray] | None = None
-    reward: Callable[[np.ndarray], np.ndarray] | None = None
-    arrival_reward: float = 0.0
+    pay: Pay | None = None
 
 
 @dataclass(frozen=True)
@@ -148,21 +159,17 @@ class BatchedEnv:
         measurement, unstable = self.plant.measurement, self.plant.unstable
         outcome = self.task.outcome(measurement, unstable)
         terminated = outcome != Outcome.RUNNING
-        reward = self.task.reward(measurement, u)
-        reward[unstable] = self.task.worst_reward
+        pay = pay_of(self.task, self.domain)
+        reward = pay.reward(measurement, u)
+        reward[unstable] = pay.worst
         if self.domain is not None:
             if (caution := self.domain.caution) is not None:
-                reward = np.minimum(reward, cautious_reward(self.task, measured, u, caution))
+                reward = np.minimum(reward, cautious_reward(self.task, measured, u, caution, pay))
             z = self.task.z(measurement)
             if self.domain.earns is not None:
-                reward = np.where(self.domain.earns(z), reward, self.task.worst_reward)
-            if self.domain.reward is not None:
-                reward = self.domain.reward(z)
-                reward[outcome == Outcome.REACHED] = self.domain.arrival_reward
-            left = np.zeros(self.n, dtype=bool)
+                reward = np.where(self.domain.earns(z), reward, pay.worst)
             if self.domain.contains is not None:
                 left = ~terminated & ~self.domain.contains(z)
-            if self.domain.reward is not None or self.domain.contains is not None:
                 # A failure costs as much: else it would end a way that costs something, and pay.
                 reward[left | (terminated & (outcome != Outcome.REACHED))] = self.domain.exit_reward
                 terminated = terminated | left
@@ -214,18 +221,24 @@ class BatchedEnv:
         return measured
 
 
+def pay_of(task: Task, domain: Domain | None = None) -> Pay:
+    """Returns what episodes are paid for: the reward of the task, unless the domain says otherwise."""
+    return (domain and domain.pay) or Pay(task.reward, task.worst_reward)
+
+
 def cautious_reward(
-    task: Task, measured: np.ndarray, u: np.ndarray, caution: np.ndarray
+    task: Task, measured: np.ndarray, u: np.ndarray, caution: np.ndarray, pay: Pay | None = None
 ) -> np.ndarray:
     """Returns the least reward (n,) of states within `caution` (p,) of measurements (n, p), inputs (n, m).
 
-    It is the task's worst where one of these states has failed. With this reward a policy learns to keep
-    clear of what noise could hide, without noise in training.
+    The reward is that of the task, or what is paid. It is the worst where one of these states has failed.
+    With this reward a policy learns to keep clear of what noise could hide, without noise in training.
     """
     shares = (-1.0, -0.5, 0.0, 0.5, 1.0) if np.count_nonzero(caution) <= 2 else (-1.0, 0.0, 1.0)
     signs = np.array(list(product(*[shares if c else (0.0,) for c in caution])))
     # All states in one call: each method takes as long for a few rows as for many.
     states = (measured + (signs * caution)[:, None]).reshape(-1, measured.shape[1])
-    reward = task.reward(states, np.tile(u, (len(signs), 1)))
-    reward = np.where(task.failed(states), task.worst_reward, reward)
+    pay = pay or pay_of(task)
+    reward = pay.reward(states, np.tile(u, (len(signs), 1)))
+    reward = np.where(task.failed(states), pay.worst, reward)
     return np.asarray(reward.reshape(len(signs), -1).min(axis=0))

@@ -27,6 +27,7 @@ class Arrivals(artifacts.SavedAsJson):
         missed: those of them that end farther from the set-point than the task's `close`.
         episodes: number of episodes.
         trainings: number of trainings of which this policy is the best; 0 of an agent.
+        shaped: whether its own was paid for being near to the goal, in place of the task's reward.
     """
 
     KIND: ClassVar[str] = "arrivals"
@@ -35,6 +36,7 @@ class Arrivals(artifacts.SavedAsJson):
     missed: int
     episodes: int
     trainings: int = 0
+    shaped: bool = False
 
     def __str__(self) -> str:
         missed = f", in {self.missed:,} of them off the set-point" if self.missed else ""

@@ -181,7 +181,7 @@ class Training(Checked):
         episode: samples until an episode is truncated, by default the task's; shorter episodes cover more
             starts.
         shaped: whether episodes are paid for being near to the goal by the shortest way around what ends
-            them, in place of the task's reward (stage 1 only).
+            them, in place of the task's reward (stage 1 only; those of the modes follow it).
         attempts: number of trainings, each with another seed, until a policy is good enough; the best policy
             is kept. In stage 1 it is if it arrives from half of the starts, and all but the first attempt are
             `shaped`, the third and later ones with twice the samples and widths.

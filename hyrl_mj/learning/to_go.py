@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from hyrl_mj.errors import HyrlError
-from hyrl_mj.gym_export import Domain
+from hyrl_mj.gym_export import Pay
 from hyrl_mj.sets import GridSet, covering, shortest_ways
 from hyrl_mj.tasks import Outcome, Task, largest_moves
 
@@ -28,17 +28,24 @@ class WayToGo:
     do, such as driving sideways, is not known to them. They lead a training out of dead ends, in which a
     reward for being close to the goal ends.
 
+    A state is worth 0 at the end of the longest way, and 1 at the goal. Who fails gets no more than that, and
+    who arrives gets what it is worth to stay: to put off an arrival does not pay.
+
     Args:
         task: the robot and its problem.
-
-    Attributes:
-        reward: (n, d) -> (n,) how near points are to the goal, from 0 at the end of the longest way to 1.
+        gamma: discount factor of the training.
+        inside: (n, d) -> (n,) bool, where ways may lead; by default everywhere.
 
     Raises:
         NoWay: no start has a way, or no node of the chart counts as arrived.
     """
 
-    def __init__(self, task: Task):
+    def __init__(
+        self,
+        task: Task,
+        gamma: float,
+        inside: Callable[[np.ndarray], np.ndarray] | None = None,
+    ):
         chart = task.chart
         nodes = covering(chart, round(NODES ** (1 / np.clip(chart.dimension, 2, 4))))
         z = nodes.nodes
@@ -46,6 +53,8 @@ class WayToGo:
         measurement = plant.measurement
         outcome = task.outcome(measurement, plant.unstable)
         runs = outcome == Outcome.RUNNING
+        if inside is not None:
+            runs &= inside(z)
         goal = (outcome == Outcome.REACHED) | (runs & task.arrived(z))
         if not goal.any() and task.set_point is not None:  # closer than a node
             goal[nodes.nearest(np.array([task.set_point]))] = True
@@ -66,16 +75,16 @@ class WayToGo:
                 "`arrived` leave one"
             )
         longest = max(float(ways[leads].max()), hop)
-        self.reward = nodes.evaluation(np.where(leads, 1 - ways / longest, 0.0))
-        self._task = task
+        self._near = nodes.evaluation(np.where(leads, 1 - ways / longest, 0.0))
+        self._task, self._follow = task, task.max_steps if gamma == 1 else 1 / (1 - gamma)
 
-    def domain(
-        self, starts: Callable[[int, np.random.Generator], np.ndarray], gamma: float
-    ) -> Domain:
-        """Returns episodes from such starts that are paid for being near to the goal, for a discount gamma.
+    @property
+    def pay(self) -> Pay:
+        """What episodes are paid for: `reward`, which is 0 at least."""
+        return Pay(self.reward, 0.0)
 
-        A state is worth 0 at the end of the longest way, and 1 at the goal. Who fails gets no more than that,
-        and who arrives gets what it is worth to stay: to put off an arrival does not pay.
-        """
-        follow = self._task.max_steps if gamma == 1 else 1 / (1 - gamma)
-        return Domain(starts, reward=self.reward, arrival_reward=follow)
+    def reward(self, measurement: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Returns how near states (n, p) are to the goal, from 0 to 1, and more where they have arrived."""
+        outcome = self._task.ending(measurement)
+        near = np.where(outcome == Outcome.RUNNING, self._near(self._task.z(measurement)), 0.0)
+        return np.where(outcome == Outcome.REACHED, self._follow, near)

@@ -334,14 +334,12 @@ class TaskGround:
     def __init__(self, task: Task, settings: Training):
         self._task, self._gamma = task, settings.gamma
         self._rehearsal = Rehearsal(task, settings) if settings.rehearse else None
-        self._way = WayToGo(task) if settings.shaped else None
+        self._pay = WayToGo(task, settings.gamma).pay if settings.shaped else None
 
     def domain(self, gamma: float) -> Domain | None:
         """Returns where episodes start if not where the task starts, and what else they are paid for."""
         starts = self._rehearsal.starts if self._rehearsal else self._task.starts
-        if self._way:
-            return self._way.domain(starts, gamma)
-        return Domain(starts) if self._rehearsal else None
+        return Domain(starts, pay=self._pay) if self._rehearsal or self._pay else None
 
     def note_losses(self, policy: MlpPolicy) -> None:
         """Notes where a policy loses and decides, for the starts of later episodes."""

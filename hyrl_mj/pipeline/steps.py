@@ -84,7 +84,8 @@ def _first_policy(run: Run, settings: Training, say: Say) -> tuple[MlpPolicy, Ar
 
     began, logs = time.monotonic(), run.path / "logs"
     policy = train(run.task, settings, run.settings.seed, log_dir=logs / "stage1", label="stage 1")
-    arrivals = replace(Arrivals.measure(run.task, policy), trainings=1)
+    found = Arrivals.measure(run.task, policy)
+    arrivals = replace(found, trainings=1, shaped=settings.shaped)
     for number in range(1, settings.attempts):
         if arrivals.most:
             break
@@ -107,7 +108,7 @@ def _first_policy(run: Run, settings: Training, say: Say) -> tuple[MlpPolicy, Ar
             break
         found = Arrivals.measure(run.task, other)
         if found.arrived > arrivals.arrived:
-            policy, arrivals = other, found
+            policy, arrivals = other, replace(found, shaped=True)
         arrivals = replace(arrivals, trainings=number + 1)
     return policy, arrivals
 
@@ -153,7 +154,9 @@ def retrain_stage(run: Run, say: Say) -> None:
     sets, task = run.extended_sets, run.task
     algorithms.check_named(run.settings.stage6.algorithm)
     held = HeldInputs.from_sets(task, sets, run.settings.table) if task.effort.attacked else None
-    results = run.settings, run.steady, run.partition, run.split, run.path / "logs"
+    # Where the task's reward has led to no goal in stage 1, it leads to none here.
+    shaped = run.arrivals.shaped
+    results = run.settings, shaped, run.steady, run.partition, run.split, run.path / "logs"
     work = partial(_retrained, task, sets, held, *results)
     done: list[tuple[ModePolicy, ModeResult]] = []
     if task.mirror is None:
@@ -173,6 +176,7 @@ def _retrained(
     sets: ExtendedSets,
     held: HeldInputs | None,
     s: Settings,
+    shaped: bool,
     policy: Policy,
     partition: Partition,
     split: Partition,
@@ -188,7 +192,7 @@ def _retrained(
     if task.effort.attacked:
         part = part_policies(task, policy, partition, sets.eps)[mode]
     return retrain(
-        mode_ground(task, sets, mode, split, policy, held is not None, s.modes, s.attack),
+        mode_ground(task, sets, mode, split, policy, held is not None, s.modes, s.attack, shaped),
         s.stage6,
         s.seed,
         warm_start=partial(start_policy, policy, partition),

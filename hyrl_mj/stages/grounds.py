@@ -7,15 +7,17 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import product
 
 import numpy as np
 
-from hyrl_mj.gym_export import Domain
+from hyrl_mj.gym_export import Domain, pay_of
 from hyrl_mj.judging import Budget, attack, game
 from hyrl_mj.learning import ModeSettings
+from hyrl_mj.learning.to_go import NoWay, WayToGo
 from hyrl_mj.learning.training import Score
 from hyrl_mj.policies import MlpPolicy, Policy, PolicyController
 from hyrl_mj.sets import GridSet, distance_to
@@ -66,6 +68,7 @@ def mode_ground(
     table: bool = False,
     settings: ModeSettings = ModeSettings(),
     attacks: AttackSettings = AttackSettings(),
+    shaped: bool = False,
 ) -> ModeGround:
     """Returns the ground of a mode.
 
@@ -81,6 +84,7 @@ def mode_ground(
         table: whether a table of inputs can be made, which may succeed where the agent does not.
         settings: where trainings start, and when a policy is good enough.
         attacks: what signals an attack tries.
+        shaped: whether trainings are paid for being near to the goal, by the shortest way in the set.
     """
     kind: type[ModeGround]
     if task.for_mode(mode) is not task:
@@ -91,7 +95,9 @@ def mode_ground(
         decides = game.Lattice.decides(task, extended.sets[0].grid)
         kind = ByGame if decides else ByEpisodes
     part = None if parts is None else parts.parts[parts.modes.index(mode)]
-    return kind(task, extended, mode, part, policy, table, settings, attacks)
+    ground = kind(task, extended, mode, part, policy, table, settings, attacks)
+    ground.shaped = shaped
+    return ground
 
 
 class ModeGround(ABC):
@@ -116,6 +122,7 @@ class ModeGround(ABC):
         settled: share of a training after which scores count.
         noise: noise on the measurements during training.
         margin: noise of so many times the bound has to be survived.
+        shaped: as in `mode_ground`.
     """
 
     enough: Score
@@ -123,6 +130,7 @@ class ModeGround(ABC):
     settled: float = 0.0
     noise: AnyNoise
     margin: float
+    shaped: bool = False
 
     def __init__(
         self,
@@ -224,9 +232,12 @@ class ModeGround(ABC):
         Beyond its part a mode earns nothing: there the task's reward leads to the other way, and it could
         pay to creep or to stay at the edge of the set, because the detour is long and returns are discounted.
         """
-        exit_reward = self.task.worst_reward / (1 - gamma)
-        earns = None if self.part is None else self.part.contains
-        return Domain(self.starts, self.within.contains, exit_reward, self.caution, earns)
+        earns, pay = None if self.part is None else self.part.contains, pay_of(self.task)
+        if self.shaped:
+            with suppress(NoWay):
+                pay = WayToGo(self.task, gamma, self.within.contains).pay
+        exit_reward = pay.worst / (1 - gamma)
+        return Domain(self.starts, self.within.contains, exit_reward, self.caution, earns, pay)
 
     def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """Draws n starts (n, d): where the game is lost, where the task starts, and all over."""
