@@ -210,7 +210,7 @@ class Training(Checked):
     episode: Annotated[int | None, Optional(Integer(1, 100_000))] = None
     shaped: Annotated[bool, Flag()] = False
     attempts: Annotated[int, Integer(1, 1_000)] = 1
-    minutes: Annotated[float, Number(0, 100_000)] = 3.0
+    minutes: Annotated[float, Number(0, 100_000)] = 10.0
     action_noise: Annotated[float, Number(0, 10)] = 0.0
     options: dict[str, Any] = field(default_factory=dict)
 

@@ -59,7 +59,7 @@ class RunOptions:
         go_on: go on also where the policy of stage 1 arrives from less than half of its starts, so that the
             other stages divide what it has not learned; preset smoke always goes on.
         stage1_minutes: where the policy of stage 1 arrives from less than half of its starts, it is trained
-            again, paid for being near to the goal, if stage 1 takes no more minutes; by default 3.
+            again, paid for being near to the goal, if stage 1 takes no more minutes; by default 10.
         set: settings to change, as they stand in config.json, such as stage1.samples=300000; by default none.
         out: the run directory; by default runs/TASK.
     """
