@@ -282,8 +282,8 @@ def _check_learned(run: Run) -> None:
     raise HyrlError(
         f"stage 1 has not learned {task.name} in {counted(arrivals.trainings, 'training')}: its policy "
         f"{arrivals} (the others: {how}{near}). See whether the goal can be reached and whether the reward "
-        f"leads there; try more with --stage1-minutes {10 * settings.minutes:g}, or train longer with --set "
-        f"stage1.samples={2 * settings.samples}, and another --out; or go on as it is with --go-on"
+        f"leads there; train longer with --set stage1.samples={2 * settings.samples} and another --out, or "
+        "go on as it is with --go-on"
     )
 
 

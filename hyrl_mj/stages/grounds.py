@@ -95,9 +95,7 @@ def mode_ground(
         decides = game.Lattice.decides(task, extended.sets[0].grid)
         kind = ByGame if decides else ByEpisodes
     part = None if parts is None else parts.parts[parts.modes.index(mode)]
-    ground = kind(task, extended, mode, part, policy, table, settings, attacks)
-    ground.shaped = shaped
-    return ground
+    return kind(task, extended, mode, part, policy, table, settings, attacks, shaped)
 
 
 class ModeGround(ABC):
@@ -107,7 +105,7 @@ class ModeGround(ABC):
     a table this may be anywhere in its set, also outside of W_i.
 
     Args:
-        task, extended, mode, policy, table, settings, attacks: as in `mode_ground`.
+        task, extended, mode, policy, table, settings, attacks, shaped: as in `mode_ground`.
         part: M_i of the mode; None where it earns its reward everywhere.
 
     Attributes:
@@ -122,7 +120,6 @@ class ModeGround(ABC):
         settled: share of a training after which scores count.
         noise: noise on the measurements during training.
         margin: noise of so many times the bound has to be survived.
-        shaped: as in `mode_ground`.
     """
 
     enough: Score
@@ -130,7 +127,6 @@ class ModeGround(ABC):
     settled: float = 0.0
     noise: AnyNoise
     margin: float
-    shaped: bool = False
 
     def __init__(
         self,
@@ -142,8 +138,10 @@ class ModeGround(ABC):
         table: bool,
         settings: ModeSettings,
         attacks: AttackSettings,
+        shaped: bool = False,
     ):
         self.task, self.extended, self.mode = task.for_mode(mode), extended, mode
+        self.shaped = shaped
         self.part, self.settings, self.attacks = part, settings, attacks
         self.bound = task.noise_in_chart(extended.eps)
         index = extended.modes.index(mode)
