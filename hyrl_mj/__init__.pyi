@@ -62,6 +62,7 @@ from .stages import (
 from .system import gl as gl
 from .system.cores import using_pool
 from .tasks import Learning, Mirror, Outcome, Scene, Task, get_task, register, task_names
+from .viz.figures.vector_field import vector_field
 
 __version__: str
 __all__ = [
@@ -123,4 +124,5 @@ __all__ = [
     "sweep",
     "task_names",
     "using_pool",
+    "vector_field",
 ]

@@ -17,7 +17,8 @@ from planted import ideal_controller
 
 import hyrl_mj
 from hyrl_mj import BadInput
-from hyrl_mj.viz import viewing
+from hyrl_mj.viz import live, viewing
+from hyrl_mj.viz.replay import marks
 from hyrl_mj.viz.replay.panel import Track
 
 
@@ -274,7 +275,7 @@ def test_without_the_extra_one_sentence_says_how_to_get_it(
     package, vehicle, arc, headless, monkeypatch
 ):
     monkeypatch.setitem(sys.modules, package, None)
-    sentence = 'there is no display, .* pip install "hyrl-mj\\[view\\]", or .* hyrl-mj replay'
+    sentence = 'needs the package mjviser .* pip install "hyrl-mj\\[view\\]", or .* hyrl-mj replay'
     with pytest.raises(BadInput, match=sentence) as caught:
         viewing.view(vehicle, arc)
     assert "\n" not in str(caught.value)
@@ -312,3 +313,74 @@ def test_a_window_that_cannot_be_opened_is_one_sentence(vehicle, arc, monkeypatc
         BadInput, match=r"cannot be opened \(run it under mjpython\): .* hyrl-mj replay"
     ):
         viewing.view(vehicle, arc)
+
+
+# ---- live
+
+
+@pytest.fixture(scope="module")
+def page(planted_circle):
+    """The controls of the page of a run of the circle, on a server that nobody has opened."""
+    import viser
+
+    server = viser.ViserServer(host="127.0.0.1", port=free_port(), verbose=False)
+    yield live.Page(planted_circle[0], server)
+    server.stop()
+
+
+def chosen(page, start, controller="HyRL", mode=live.SELECTED, noise="alternating", bound=0.1):
+    """The arc that the page shows for what is chosen on it."""
+    page.start[0].value, page.bound.value = start, bound
+    page.controller.value, page.mode.value, page.noise.value = controller, mode, noise
+    page.advance(0.0)
+    return page.track.arc
+
+
+def test_what_is_chosen_is_simulated_as_in_python(page):
+    run = page.run
+    for controller, name in live.CONTROLLERS.items():
+        arc = chosen(page, 3.0, controller, noise="uniform", bound=0.05)
+        noise = hyrl_mj.Noise("uniform", 0.05)
+        alone = hyrl_mj.simulate(run.task, run.controllers[name], [3.0], noise=noise)
+        np.testing.assert_array_equal(arc.z, alone.z)
+    for q in run.extended_sets.modes:
+        assert chosen(page, np.pi, mode=run.task.mode_name(q)).q[0] == q
+    arc = chosen(page, 3.0, noise="uniform")
+    page._draw_again(None)
+    page.advance(0.0)
+    assert (page.track.arc.measured[0] != arc.measured[0]).any()
+
+
+def test_the_start_is_where_the_handle_has_been_dragged(page):
+    chosen(page, 3.0)
+    task = page.run.task
+    page.handle.position = marks.tracked_points(task, task.state(np.array([[1.0]]))[0])[0]
+    page._drag(None)
+    page.advance(0.0)
+    assert page.track.arc.z[0, 0] == pytest.approx(1.0, abs=2 * np.pi / live.PLACES)
+
+
+def test_what_is_measured_the_mode_and_the_time_are_shown(page):
+    arc, task = chosen(page, 3.0), page.run.task
+    page.playing.value = True
+    page.advance(0.12)
+    assert page.t == pytest.approx(0.12)
+    page._stepped.set()
+    page.advance(1.0)
+    assert page.t == pytest.approx(0.12 + task.dt)
+    assert not page.playing.value
+    page.advance(1.0)
+    assert page.t == pytest.approx(0.12 + task.dt)  # it stands
+    row = arc.at(page.t)
+    measured = marks.tracked_points(task, task.state(task.z(arc.measured[row : row + 1]))[0])[0]
+    np.testing.assert_allclose(page._ghost.position, measured, atol=1e-6)
+    assert page._label.text == task.mode_name(int(arc.q[row]))
+    assert f"t = {page.t:.2f} s" in page.told.content
+
+
+def test_what_cannot_be_simulated_is_said_on_the_page(page):
+    before = chosen(page, 3.0)
+    page.bound.value = -1.0
+    page._simulate()
+    assert "-1" in page.told.content
+    assert page.track.arc is before

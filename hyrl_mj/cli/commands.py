@@ -387,16 +387,22 @@ def drive(
         drives.drive_run(run, field, options, out, how, shown)
 
 
-def view(run: Run, *, arc: str = "critical_hyrl_q0", port: int = 0) -> None:
-    """Replay an arc in MuJoCo's viewer, or in a browser where there is no display.
+def view(run: Run, *, arc: str | None = None, port: int = 0) -> None:
+    """Simulate a run live in a browser, or replay an arc.
 
-    The viewer for a browser takes pip install "hyrl-mj[view]". Ctrl+C ends it.
+    On the page the start is dragged, and controller, mode, noise and bound are chosen. It takes
+    pip install "hyrl-mj[view]". Ctrl+C ends it.
 
     Args:
-        arc: the name of a file in the folder arcs of the run.
+        arc: the name of a file in the folder arcs of the run, to replay in MuJoCo's viewer, or in a browser
+            where there is no display; by default the run is simulated live.
         port: port of the web viewer, which only this machine can reach, or 0 for the first free one from
             8080 on.
     """
+    if arc is None:
+        from hyrl_mj.viz.live import live
+
+        return live(run, port)
     from hyrl_mj.viz.viewing import view
 
     paths = {path.stem: path for path in sorted((run.path / "arcs").glob("*.npz"))}

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import platform
+from base64 import b64encode
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from hashlib import sha256
+from html import escape
 from importlib.metadata import version
 from pathlib import Path
 
@@ -16,7 +18,7 @@ import mujoco
 import numpy as np
 
 from hyrl_mj import policies
-from hyrl_mj.errors import BadArtifact, BadInput, unknown
+from hyrl_mj.errors import BadArtifact, BadInput, HyrlError, unknown
 from hyrl_mj.fields import acting_policy
 from hyrl_mj.files import artifacts
 from hyrl_mj.files.manifest import FILES, Manifest, check_contents, locked, may_hold
@@ -66,6 +68,18 @@ class Run:
     def __repr__(self) -> str:
         s, path = self.settings, str(self.path)
         return f"Run({path!r}: {s.task}, eps {s.eps:g}, seed {s.seed}, preset {s.preset})"
+
+    def _repr_html_(self) -> str:
+        """Returns what a notebook shows: the verdict with its reasons, and the overview."""
+        parts = [f"<p>{escape(repr(self))}</p>"]
+        with suppress(HyrlError):
+            parts.append(f"<p><b>{escape(str(self.verdict))}</b></p><ul>")
+            parts += [f"<li>{escape(reason)}</li>" for reason in self.verdict.reasons] + ["</ul>"]
+        with suppress(HyrlError):
+            content = self._checked("figures/overview.png").read_bytes()
+            image = f"data:image/png;base64,{b64encode(content).decode()}"
+            parts.append(f'<img alt="overview" width="780" src="{image}">')
+        return "".join(parts)
 
     @cached_property
     def task(self) -> Task:

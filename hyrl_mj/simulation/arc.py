@@ -96,10 +96,10 @@ class HybridArc(Saved):
 
     def plot(self) -> Figure:
         """Returns a figure of the chart coordinates over time, coloured by mode, jumps as dashed lines."""
-        from matplotlib.figure import Figure  # slow to import
+        from hyrl_mj.system.picture import Picture  # matplotlib is slow to import
 
         dimension = self.z.shape[1]
-        figure = Figure(figsize=(6.4, 1.4 + 1.6 * dimension), layout="constrained")
+        figure = Picture(figsize=(6.4, 1.4 + 1.6 * dimension), layout="constrained")
         panels = figure.subplots(dimension, sharex=True, squeeze=False)[:, 0]
         figure.suptitle(f"{self.task}, {self._summary}", fontsize="medium")
         jumps = np.flatnonzero(np.diff(self.j))

@@ -1,7 +1,7 @@
 """Pictures, videos, tables and pages of the results of a run.
 
-The modules `diagnosis`, `drives`, `encoding`, `figures`, `replay`, `report`, `shows` and `viewing` import
-matplotlib, Pillow or a GL library, so they are imported only where they are needed.
+The modules `diagnosis`, `drives`, `encoding`, `figures`, `live`, `replay`, `report`, `shows` and `viewing`
+import matplotlib, Pillow or a GL library, so they are imported only where they are needed.
 """
 
 from hyrl_mj.viz.commands import beginning
@@ -24,6 +24,7 @@ __all__ = [
     "drives",
     "encoding",
     "figures",
+    "live",
     "pages",
     "print_compared",
     "print_noise",

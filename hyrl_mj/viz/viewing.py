@@ -90,13 +90,22 @@ def _window(model: mujoco.MjModel, data: mujoco.MjData) -> AbstractContextManage
 
 @contextmanager
 def _web(model: mujoco.MjModel, data: mujoco.MjData, port: int, say: Say) -> Iterator[Any]:
-    """Serves a page with the model until the block ends."""
+    """Serves a page that is never closed: one that a user closes can be opened again."""
+    with served(model, data, port, say) as (_, scene):
+        yield SimpleNamespace(is_running=lambda: True, sync=lambda: scene.update_from_mjdata(data))
+
+
+@contextmanager
+def served(
+    model: mujoco.MjModel, data: mujoco.MjData, port: int, say: Say
+) -> Iterator[tuple[Any, Any]]:
+    """Serves a page with a model until the block ends, which gets viser's server and mjviser's scene."""
     try:
         import viser
         from mjviser import ViserMujocoScene
     except ImportError as error:
         raise BadInput(
-            f"there is no display, and the viewer for a browser needs the package mjviser ({error}): "
+            f"the viewer for a browser needs the package mjviser ({error}): "
             'pip install "hyrl-mj[view]", or make a video with hyrl-mj replay'
         ) from error
 
@@ -121,8 +130,7 @@ def _web(model: mujoco.MjModel, data: mujoco.MjData, port: int, say: Say) -> Ite
         scene.update_from_mjdata(data)
         address = f"http://{LOOPBACK}:{server.get_port()}/"
         say(f"watch {address} (only from this machine); Ctrl+C ends it")
-        # A page that is closed can be opened again, and Ctrl+C ends it.
-        yield SimpleNamespace(is_running=lambda: True, sync=lambda: scene.update_from_mjdata(data))
+        yield server, scene
     finally:
         with redirect_stdout(StringIO()):
             server.stop()

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from hyrl_mj.errors import BadInput
 from hyrl_mj.files import artifacts
 from hyrl_mj.simulation import LogNoise
+from hyrl_mj.system.picture import Picture
 from hyrl_mj.viz import colours
 from hyrl_mj.viz.figures.style import DPI, STYLE, WIDTH, grid_lines
 
@@ -29,7 +30,7 @@ def draw_noise(noise: LogNoise, path: Path | None = None) -> Figure:
         raise BadInput(f"--out {path} cannot be written: give a name that ends in .png")
     columns = [column for column in noise.columns if len(column.errors)][:MOST]
     with styles.context(["default", STYLE, SIZES]):
-        figure = Figure(figsize=(WIDTH, 0.6 + 4.6 * len(columns)), layout="constrained")
+        figure = Picture(figsize=(WIDTH, 0.6 + 4.6 * len(columns)), layout="constrained")
         parts = figure.subfigures(len(columns), 1, squeeze=False).ravel()
         for part, c in zip(parts, columns, strict=True):
             panels = part.subplot_mosaic([["time", "time"], ["histogram", "correlation"]])

@@ -20,6 +20,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from hyrl_mj.files import artifacts
 from hyrl_mj.sets import Chart
+from hyrl_mj.system.picture import Picture
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz.colours import INK, mode_colour
 from hyrl_mj.viz.section import Section
@@ -62,7 +63,7 @@ def drawing(height: float, of: Task | Section, title: str) -> Iterator[Figure]:
     # The user's own matplotlibrc must not change the figure.
     with style.context(["default", STYLE]):
         layout = ConstrainedLayoutEngine(compress=True, h_pad=PAD, w_pad=PAD)
-        figure = Figure(figsize=(WIDTH, height), layout=layout)
+        figure = Picture(figsize=(WIDTH, height), layout=layout)
         figure.suptitle(f"{task_title(task)}{where}: {title}", fontsize=12, fontweight="bold")
         yield figure
 
@@ -84,7 +85,7 @@ def write(figure: Figure, path: Path) -> None:
 def plotting(height: float) -> Iterator[Figure]:
     """Gives a figure of curves to draw on, without a title, whose legend is written at the end."""
     with style.context(["default", STYLE]):
-        figure = Figure(figsize=(WIDTH, height), layout="constrained")
+        figure = Picture(figsize=(WIDTH, height), layout="constrained")
         yield figure
         for panel in figure.axes:
             open_panel(panel)

@@ -1,0 +1,103 @@
+"""Where the policy, and each mode of the hybrid controller, moves the robot from each state."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from hyrl_mj.policies import Policy
+from hyrl_mj.runs.directory import Run
+from hyrl_mj.sets import Grid, GridSet
+from hyrl_mj.tasks import Task
+from hyrl_mj.viz.colours import POLICY, mode_colour
+from hyrl_mj.viz.figures import charts, style
+from hyrl_mj.viz.figures.charts import INNER, OUTER
+from hyrl_mj.viz.section import Section
+
+CELLS, RING = 24, 48  # arrows along the longest side of a plane, and around a ring
+
+
+def vector_field(run: Run) -> Figure:
+    """Draws the vector fields of the closed loops without noise: the policy's, and each mode's in its set.
+
+    An arrow is the motion of the chart point in one sample. Of a chart with more than two coordinates a
+    section is shown, and of a robot with inertia the motion from rest.
+
+    Args:
+        run: whose stages up to the policies of the modes are finished.
+
+    Returns:
+        The figure, with a panel for each loop.
+
+    Raises:
+        BadInput: the chart is neither a plane nor a ring, nor has a section that is a plane.
+    """
+    task, section = run.task, Section(run.task)
+    charts.check_drawable(task)
+    sets = section.extended_sets(run.extended_sets)
+    panels: list[tuple[str, str, Policy, GridSet | None]]
+    panels = [(run.policy_title, POLICY, run.steady, None)]
+    for i, mode in enumerate(sets.modes):
+        title = f"HyRL, mode {task.mode_name(mode)}"
+        panels.append((title, mode_colour(i), run.controller.policies[mode], sets.sets[i]))
+    ring = charts.is_ring(task.chart)
+    grid = Grid(section.chart, (RING,)) if ring else Grid.with_cells(section.chart, CELLS)
+    rows = -(-len(panels) // style.COLUMNS)
+    width, height = (1.0, 1.0) if ring else section.chart.sides
+    each = 0.85 * style.WIDTH / style.COLUMNS * height / width + 0.6  # [inches]
+    critical = section.critical_set(run).points
+    with style.drawing(1.2 + rows * each, section, "motion in one sample, without noise") as figure:
+        axes = figure.subplots(rows, style.COLUMNS, squeeze=False).ravel()
+        for panel, (title, colour, policy, members) in zip(axes, panels, strict=False):
+            panel.set_title(title, color=colour, fontweight="bold")
+            nodes = grid.nodes[~section.failed(grid.nodes)] if not ring else grid.nodes
+            inside = np.ones(len(nodes), bool) if members is None else members.contains(nodes)
+            z = nodes[inside]
+            arrows = one_sample(task, policy, section.lift(z))[:, : section.chart.dimension]
+            (_ring if ring else _plane)(panel, section, z, arrows, colour, critical)
+        for panel in axes[len(panels) :]:
+            panel.set_axis_off()
+        style.legend(figure)
+    return figure
+
+
+def one_sample(task: Task, policy: Policy, z: np.ndarray) -> np.ndarray:
+    """Returns how far (n, d) a policy moves the robot from chart points (n, d) in one sample."""
+    plant = task.plant(len(z))
+    plant.set_state(*task.state(z))
+    plant.step(policy.act(plant.measurement))
+    return task.chart.difference(task.z(plant.measurement), z)
+
+
+def _plane(
+    panel: Axes,
+    section: Section,
+    z: np.ndarray,
+    arrows: np.ndarray,
+    colour: str,
+    critical: np.ndarray,
+) -> None:
+    """Draws arrows (n, 2) at points (n, 2) of a plane."""
+    charts.plane(panel, section)
+    panel.quiver(*z.T, *arrows.T, color=colour, pivot="mid", angles="xy", width=0.005, zorder=3)
+    charts.dots(panel, critical)
+
+
+def _ring(
+    panel: Axes,
+    section: Section,
+    z: np.ndarray,
+    arrows: np.ndarray,
+    colour: str,
+    critical: np.ndarray,
+) -> None:
+    """Draws arrows (n, 1) at values (n, 1) of a periodic coordinate along a ring."""
+    charts.ring(panel, section.chart, (OUTER, INNER))
+    x, y = charts.on_ring(section.chart, z[:, 0])
+    middle = (OUTER + INNER) / 2
+    along = arrows[:, 0] * np.array([-y, x])
+    panel.quiver(middle * x, middle * y, *along, color=colour, pivot="mid", width=0.006, zorder=3)
+    charts.spokes(panel, section.chart, critical, INNER - 0.06)
+    if section.set_point is not None:
+        charts.cross(panel, *np.ravel(charts.on_ring(section.chart, section.set_point)))
