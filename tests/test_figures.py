@@ -3,15 +3,28 @@
 from __future__ import annotations
 
 import re
+from base64 import b64decode
 from dataclasses import replace
+from html import unescape
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from figure_parts import EPS, arcs_of, sets_of, shown_of, where, written
+from figure_parts import (
+    EPS,
+    arcs_of,
+    controller_of,
+    policy_of,
+    sets_of,
+    shown_of,
+    where,
+    written,
+)  # fmt: skip
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Wedge
 from matplotlib.path import Path as Outline
+from matplotlib.quiver import Quiver
 from planted import Cube, decisions, plane_policy, without_pictures
 
 import hyrl_mj
@@ -22,6 +35,7 @@ from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.partition import Partition
 from hyrl_mj.viz import colours, figures
 from hyrl_mj.viz.figures import charts, runs, style
+from hyrl_mj.viz.figures.vector_field import vector_field
 from hyrl_mj.viz.pages import pictures
 from hyrl_mj.viz.section import Section
 
@@ -443,3 +457,52 @@ def test_a_path_round_a_period_is_broken_at_the_seam():
     assert np.nanmax(x) < 2 * np.pi
     assert (y[~np.isnan(y)] == 1).all()
     assert not charts.is_ring(Torus.chart)
+
+
+# ---- vector fields, and what notebooks show
+
+
+@TASKS
+def test_arrows_are_the_motion_of_the_policy_and_of_each_mode_in_its_set(task):
+    controller, sets = controller_of(task), sets_of(task)
+    run = SimpleNamespace(
+        task=task, extended_sets=sets, controller=controller, critical_set=decisions(task),
+        policy_title="RL policy", steady=policy_of(task),
+    )  # fmt: skip
+    figure = vector_field(run)
+    panels = [panel for panel in figure.axes if panel.get_title()]
+    assert len(panels) == 3
+    for panel, policy, members in zip(
+        panels, [run.steady, *controller.policies.values()], [None, *sets.sets], strict=True
+    ):
+        (arrows,) = (drawn for drawn in panel.collections if isinstance(drawn, Quiver))
+        z = np.array(arrows.XY, dtype=float)
+        if task is CIRCLE:
+            z = np.mod(np.arctan2(z[:, 1], z[:, 0]), 2 * np.pi)[:, None]
+        assert len(z) > 10
+        assert members is None or members.contains(z).all()
+        moved = task.chart.difference(simulate_one(task, policy, z), z)
+        if task is CIRCLE:
+            moved = moved * np.column_stack([-np.sin(z), np.cos(z)])
+        drawn = np.column_stack([arrows.U, arrows.V])
+        np.testing.assert_allclose(
+            drawn / np.abs(drawn).max(), moved / np.abs(moved).max(), atol=1e-6
+        )
+
+
+def simulate_one(task, policy, z):
+    """Chart points (n, d) one sample after others."""
+    arcs = simulate(task, policy, z, hyrl_mj.Noise("none", 0.0), horizon=task.dt)
+    return np.array([arc.z[-1] for arc in arcs])
+
+
+def test_a_notebook_shows_figures(planted_circle):
+    run = planted_circle[0]
+    for figure in (run.arcs()["start0", "policy"].plot(), vector_field(run)):
+        assert figure._repr_png_().startswith(b"\x89PNG")
+    page = run._repr_html_()
+    assert str(run.verdict) in unescape(page)
+    assert b64decode(page.split("base64,")[1].split('"')[0]).startswith(b"\x89PNG")
+    unfinished = hyrl_mj.load_run(run.path)
+    object.__setattr__(unfinished, "path", run.path / "nowhere")
+    assert "unit_circle" in unfinished._repr_html_()

@@ -1,3 +1,3 @@
-"""What the machine gives: cores, processes with limits, generators, streams, progress bars, a GL backend."""
+"""What the machine gives: cores, limited processes, generators, streams, progress, pictures, a GL backend."""
 
-__all__ = ["cores", "forked", "generators", "gl", "limits", "progress", "streams"]
+__all__ = ["cores", "forked", "generators", "gl", "limits", "picture", "progress", "streams"]

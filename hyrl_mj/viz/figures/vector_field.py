@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -10,12 +12,15 @@ from hyrl_mj.policies import Policy
 from hyrl_mj.runs.directory import Run
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.tasks import Task
-from hyrl_mj.viz.colours import POLICY, mode_colour
+from hyrl_mj.viz.colours import BAD, POLICY, mode_colour
 from hyrl_mj.viz.figures import charts, style
 from hyrl_mj.viz.figures.charts import INNER, OUTER
 from hyrl_mj.viz.section import Section
 
 CELLS, RING = 24, 48  # arrows along the longest side of a plane, and around a ring
+# The longest arrow is as long as the arrows are apart.
+LOOKS: dict[str, Any] = {"pivot": "mid", "angles": "xy", "scale_units": "xy", "scale": 1}
+LOOKS |= {"width": 0.005, "headwidth": 4, "headlength": 5, "zorder": 3}
 
 
 def vector_field(run: Run) -> Figure:
@@ -55,6 +60,10 @@ def vector_field(run: Run) -> Figure:
             inside = np.ones(len(nodes), bool) if members is None else members.contains(nodes)
             z = nodes[inside]
             arrows = one_sample(task, policy, section.lift(z))[:, : section.chart.dimension]
+            if members is not None and not ring:
+                charts.region(panel, members, f"{colour}20")
+            longest = np.nanmax(np.linalg.norm(arrows, axis=1), initial=1e-9)
+            arrows = 0.9 * arrows / longest * (1 if ring else grid.spacing.max())
             (_ring if ring else _plane)(panel, section, z, arrows, colour, critical)
         for panel in axes[len(panels) :]:
             panel.set_axis_off()
@@ -80,8 +89,8 @@ def _plane(
 ) -> None:
     """Draws arrows (n, 2) at points (n, 2) of a plane."""
     charts.plane(panel, section)
-    panel.quiver(*z.T, *arrows.T, color=colour, pivot="mid", angles="xy", width=0.005, zorder=3)
-    charts.dots(panel, critical)
+    panel.quiver(*z.T, *arrows.T, color=colour, **LOOKS)
+    charts.dots(panel, critical, BAD)
 
 
 def _ring(
@@ -96,8 +105,8 @@ def _ring(
     charts.ring(panel, section.chart, (OUTER, INNER))
     x, y = charts.on_ring(section.chart, z[:, 0])
     middle = (OUTER + INNER) / 2
-    along = arrows[:, 0] * np.array([-y, x])
-    panel.quiver(middle * x, middle * y, *along, color=colour, pivot="mid", width=0.006, zorder=3)
-    charts.spokes(panel, section.chart, critical, INNER - 0.06)
+    along = arrows[:, 0] * 2 * np.pi * middle / RING * np.array([-y, x])
+    panel.quiver(middle * x, middle * y, *along, color=colour, **LOOKS)
+    charts.spokes(panel, section.chart, critical, INNER - 0.06, BAD)
     if section.set_point is not None:
         charts.cross(panel, *np.ravel(charts.on_ring(section.chart, section.set_point)))
