@@ -27,7 +27,7 @@ from hyrl_mj.stages import grounds
 from hyrl_mj.stages.critical_set import CriticalSet
 from hyrl_mj.stages.partition import Partition
 from hyrl_mj.tasks import Learning, Outcome, Scene, Task, trial
-from hyrl_mj.viz import diagnosis
+from hyrl_mj.viz import diagnosis, section
 from hyrl_mj.viz.figures import style
 
 # Settings of a smoke run on the circle whose worst-case game takes two seconds.
@@ -154,6 +154,7 @@ def coarsen(patch):
     """Patches what is shown and played: few pixels, few frames, a simple font, few replays of proofs."""
     patch.setattr(worst_case, "CURVE", worst_case.CURVE[::4])
     patch.setattr(style, "DPI", 60)
+    patch.setattr(section, "OVER", 120)
     patch.setitem(style.STYLE, "pdf.fonttype", 3)
     few = {"size": (480, 160), "fps": 2}
     patch.setattr(steps, "SMOKE", replace(steps.SMOKE, **few))
