@@ -567,19 +567,12 @@ def onnx_file(folder, weight, bias, rows="n", integers=False, dtype=np.float32, 
 
 
 @pytest.fixture
-def runtime():
-    import onnxruntime
-
-    return onnxruntime
-
-
-@pytest.fixture
 def numbers():
     return np.random.default_rng(0)
 
 
 @pytest.mark.parametrize(("rows", "observed"), [("n", ""), (1, ""), ("n", "float64")])
-def test_an_onnx_model_acts(rows, observed, circle, runtime, numbers, tmp_path, monkeypatch):
+def test_an_onnx_model_acts(rows, observed, circle, numbers, tmp_path, monkeypatch):
     # As of the environments of Gymnasium that MuJoCo simulates.
     monkeypatch.setattr(type(circle), "observation_dtype", observed)
     weight, bias = numbers.normal(size=(1, 2)), numbers.normal(size=1)
@@ -591,7 +584,7 @@ def test_an_onnx_model_acts(rows, observed, circle, runtime, numbers, tmp_path, 
 
 
 def test_an_onnx_model_that_ends_in_tanh_has_inputs_between_one_and_minus_one(
-    circle, runtime, numbers, tmp_path
+    circle, numbers, tmp_path
 ):
     weight, bias = numbers.normal(size=(1, 2)), numbers.normal(size=1)
     path = onnx_file(tmp_path, weight, bias, squashed=True)
@@ -606,7 +599,7 @@ def test_an_onnx_model_that_ends_in_tanh_has_inputs_between_one_and_minus_one(
 
 
 @pytest.mark.parametrize("integers", [False, True])
-def test_an_onnx_model_of_a_discrete_task_acts(integers, vehicle, runtime, numbers, tmp_path):
+def test_an_onnx_model_of_a_discrete_task_acts(integers, vehicle, numbers, tmp_path):
     weight, bias = numbers.normal(size=(5, 3)), numbers.normal(size=5)
     policy = load_agent(onnx_file(tmp_path, weight, bias, integers=integers), vehicle)
     observation = observations(vehicle, 200)
@@ -626,7 +619,7 @@ def test_an_onnx_model_of_a_discrete_task_acts(integers, vehicle, runtime, numbe
     ],
 )
 def test_an_onnx_model_that_does_not_fit_is_refused(
-    name, shape, options, message, runtime, numbers, tmp_path
+    name, shape, options, message, numbers, tmp_path
 ):
     path = onnx_file(tmp_path, numbers.normal(size=shape), np.zeros(shape[0]), **options)
     with pytest.raises(BadArtifact, match=message) as error:
@@ -634,16 +627,14 @@ def test_an_onnx_model_that_does_not_fit_is_refused(
     assert "a.onnx" in str(error.value)
 
 
-def test_weights_of_an_onnx_model_that_are_not_finite_are_refused(
-    circle, vehicle, runtime, tmp_path
-):
+def test_weights_of_an_onnx_model_that_are_not_finite_are_refused(circle, vehicle, tmp_path):
     with pytest.raises(BadArtifact, match="gives nan"):
         load_agent(onnx_file(tmp_path, np.full((1, 2), np.nan), np.zeros(1)), circle)
     with pytest.raises(BadArtifact, match="preference is not a finite number"):
         load_agent(onnx_file(tmp_path, np.full((5, 3), np.nan), np.zeros(5)), vehicle)
 
 
-def test_a_damaged_onnx_file_is_refused(circle, runtime, tmp_path):
+def test_a_damaged_onnx_file_is_refused(circle, tmp_path):
     path = tmp_path / "a.onnx"
     with pytest.raises(BadArtifact, match=r"there is no file .*a\.onnx"):
         load_agent(path, circle)

@@ -18,7 +18,7 @@ from hyrl_mj import Outcome
 from hyrl_mj.gym_export.core import BatchedEnv
 from hyrl_mj.judging import examination
 from hyrl_mj.policies.controllers import PolicyController
-from hyrl_mj.simulation import WayRuns, way_runs
+from hyrl_mj.simulation import way_runs
 from hyrl_mj.tasks import registry, trial
 from hyrl_mj.tasks.checks import check_task
 from hyrl_mj.tasks.registry import reference
@@ -387,11 +387,10 @@ def test_a_simulation_that_breaks_down_ends_its_episode_alone(tmp_path, monkeypa
             return np.stack([aside, np.zeros(len(measured))], axis=1)
 
     z0 = np.array([[0.0, y, 0.5] for y in (0.5, 0.6, -0.55)])
-    rollout = way_runs(task, Push(), z0)
+    runs, rollout = way_runs(task, Push(), z0)
     assert rollout.outcome.tolist() == [Outcome.REACHED, Outcome.UNSTABLE, Outcome.REACHED]
     assert rollout.length[1] == 1
     np.testing.assert_array_equal(rollout.path[1:, 1], rollout.path[:-1, 1])
-    runs = WayRuns.from_rollout(task, rollout)
     assert runs.usable.tolist() == [True, False, True]
     assert runs[np.array([0])].differ(runs[np.array([2])]).tolist() == [True]
     calm = hyrl_mj.closed_loop(task, PolicyController(Push()), z0[[0, 2]])

@@ -21,6 +21,7 @@ from hyrl_mj import BadInput, Noise, Outcome, Recorded, Sample, simulate, simula
 from hyrl_mj.judging.attack_search import Search, Waves
 from hyrl_mj.judging.attacks import Budget, attack, attack_starts
 from hyrl_mj.judging.episodes import Regions
+from hyrl_mj.judging.examination import ExamineOptions
 from hyrl_mj.judging.game import NEVER, Game
 from hyrl_mj.learning.presets import preset
 from hyrl_mj.policies import PolicyController
@@ -222,20 +223,23 @@ def test_no_round_follows_one_by_which_enough_is_lost(vehicle):
 
 
 @pytest.mark.parametrize(
-    ("budget", "message"),
+    ("options", "message"),
     [
-        ({"seconds": 0.0}, "an attack cannot last 0 s: give a time > 0 and <= 86400 s"),
-        ({"seconds": float("nan")}, "cannot last nan s"),
-        ({"seconds": 1e6}, "cannot last 1e\\+06 s"),
-        ({"rounds": 0}, "an attack cannot have 0 rounds: give a number from 1"),
-        ({"rounds": 10**9}, "cannot have 1000000000 rounds"),
-        ({}, "a time or a number of rounds: give one of the two"),
-        ({"rounds": 1, "seconds": 1.0}, "give one of the two"),
+        (
+            {"attack_seconds": 0.0},
+            "attack_seconds 0.0 cannot be used: give a number > 0 and <= 86400",
+        ),
+        ({"attack_seconds": float("nan")}, "attack_seconds nan"),
+        ({"attack_rounds": 0}, "attack_rounds 0 cannot be used: give an integer from 1 to 100,000"),
+        ({"attack_starts": 10**9}, "attack_starts 1000000000"),
+        ({"episodes": 0}, "episodes 0 cannot be used: give an integer from 1 to 1,000,000,000"),
+        ({"episodes": 10**30}, "1,000,000,000"),
+        ({"attack_rounds": 1, "attack_seconds": 1.0}, "give one of the two"),
     ],
 )
-def test_an_impossible_budget_is_refused(budget, message):
+def test_an_impossible_examination_is_refused(options, message):
     with pytest.raises(BadInput, match=message):
-        Budget(**budget)
+        ExamineOptions(**options).budget(Effort(), exact=True)
 
 
 def test_starts_and_bounds_that_make_no_sense_are_refused(vehicle):

@@ -86,16 +86,6 @@ def test_nodes_lie_on_their_own_side(half):
     np.testing.assert_array_equal(half.contains(half.grid.nodes), half.mask)
 
 
-def test_union_intersection_and_complement(half):
-    a, other = half, half.dilated(-0.3)
-    for members, mask in (
-        (a | other, a.mask | other.mask),
-        (a & other, a.mask & other.mask),
-        (~a, ~a.mask),
-    ):
-        np.testing.assert_array_equal(members.mask, mask)
-
-
 def test_values_that_are_linear_are_interpolated_exactly():
     cloud, slope = Cloud.even(BOX, 2_000, SHARES), np.array([1.0, -2, 0.5, 0, 3, 1])
     z = drawn(500, 3) * 0.9

@@ -171,13 +171,6 @@ def test_a_single_mode_keeps_everything(vehicle):
     np.testing.assert_array_equal(far, [np.inf] * 3)
 
 
-def test_the_distance_to_the_critical_set_goes_the_short_way(circle, on_circle):
-    distance = distance_to(
-        circle.chart, on_circle.critical.points, np.array([[0.0], [PI + 1], [7 * PI - 1]])
-    )
-    np.testing.assert_allclose(distance, [PI, 1.0, 1.0], atol=2e-3)
-
-
 # ---- sized to the noise
 
 
@@ -222,14 +215,6 @@ def test_the_sets_on_the_circle_have_room_everywhere(on_circle, circle):
     theta = np.linspace(0.5, 2 * PI - 0.5, 20_000)
     reach = theta[sets.sets[0].contains(theta[:, None])].max()
     assert reach == pytest.approx(PI + 0.25, abs=2 * sets.sets[0].grid.cell)
-
-
-def test_sized_sets_survive_being_written(sized, vehicle, tmp_path):
-    sized[0.1].save(tmp_path / "sets.npz")
-    back = type(sized[0.1]).load(tmp_path / "sets.npz", vehicle)
-    for name in ("points", "room", "between", "narrow"):
-        np.testing.assert_array_equal(getattr(back, name), getattr(sized[0.1], name))
-    assert back.horizon == sized[0.1].horizon
 
 
 # ---- plants that cannot be run backward

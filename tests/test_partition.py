@@ -120,13 +120,6 @@ def test_a_part_policy_of_a_hesitant_policy_is_decided_at_the_critical_set(circl
     assert second.act(at)[0, 0] == pytest.approx(1.0, abs=0.06)
 
 
-def test_a_part_policy_on_the_vehicle(vehicle, vehicle_parts):
-    left, right = part_policies(vehicle, sign_policy(vehicle), vehicle_parts, 0.1)
-    z = np.array([[0.1, 0.3], [0.1, 0.0], [0.1, -0.3]])
-    np.testing.assert_array_equal(left.act(z), [[1.0]] * 3)
-    np.testing.assert_array_equal(right.act(z), [[-1.0]] * 3)
-
-
 def test_a_run_goes_astray_that_comes_into_a_part_where_it_shares_it_with_the_start_s_own(circle):
     """Of three parts the second holds the start, and the third overlaps with the first, too."""
     grid = Grid.from_counts(circle.chart, np.array([8]))

@@ -206,7 +206,7 @@ def test_episodes_are_added_on_demand(run):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"episodes": 0}, "0 episodes cannot be simulated"),
+        ({"episodes": 0}, "episodes 0 cannot be used"),
         ({"seed": -1}, "seed -1 cannot be used"),
         ({"eps": -0.1}, "finite number >= 0"),
         ({"eps": 100.0}, "hides the whole state space"),

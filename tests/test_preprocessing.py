@@ -183,21 +183,6 @@ def test_its_steady_answer_is_that_to_an_unchanged_measurement(vehicle, tmp_path
     np.testing.assert_array_equal(steady.act(measured), policy.act(measured))
 
 
-def test_adversarial_noise_knows_what_the_agent_remembers(vehicle, tmp_path):
-    """It chooses as it would against a controller whose state is written out."""
-    _, path, needs = agent(DQN, vehicle, tmp_path, WRAPPED["stacked"])
-    policy = load_agent(path, vehicle, **needs)
-    starts = vehicle.starts(20, np.random.default_rng(0))
-    first = simulate(vehicle, policy, starts, Noise("adversarial", 0.1), horizon=1.0)
-    again = simulate(vehicle, policy, starts, Noise("adversarial", 0.1), horizon=1.0)
-    calm = simulate(vehicle, policy, starts, Noise("none"), horizon=1.0)
-    for one, two in zip(first, again, strict=True):
-        np.testing.assert_array_equal(one.z, two.z)  # asking leaves nothing in the memory
-    assert any(
-        a.z.shape != b.z.shape or (a.z != b.z).any() for a, b in zip(first, calm, strict=True)
-    )
-
-
 def test_a_sampled_agent_is_normalised_too(circle, tmp_path):
     _, path, needs = agent(PPO, circle, tmp_path, WRAPPED["normalised"])
     drawn = load_agent(path, circle, stochastic=True, **needs)

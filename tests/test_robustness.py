@@ -17,8 +17,7 @@ from planted import (
     sign_policy,
 )
 
-from hyrl_mj import BadArtifact, BadInput, Noise, simulate
-from hyrl_mj.files import artifacts
+from hyrl_mj import BadInput, Noise, simulate
 from hyrl_mj.judging import margin_text, worst_case as examination
 from hyrl_mj.judging.game import (
     CURVE,
@@ -97,13 +96,6 @@ def test_the_ideal_rule_wins_everything_but_the_wrong_start_mode(on_vehicle):
     assert 0.9 < score.won_any < 1.0
     assert score.time == score.time_any == pytest.approx(3.0)
     assert score.excursion is None, "every run is over some day"
-
-
-def test_the_circle_s_times_are_those_of_the_longest_way(on_circle):
-    score = on_circle[0].score("hysteresis", 0.1)
-    assert score.won == score.won_any == score.winnable == 1.0
-    assert score.time == pytest.approx(PI + 0.1 - 0.3, abs=0.1)
-    assert score.time_any == pytest.approx(PI + 0.4 + 0.1 - 0.3, abs=0.1)
 
 
 @pytest.mark.parametrize("eps", [0.0, 0.1, 0.2])
@@ -400,15 +392,6 @@ def test_an_examination_survives_being_written(examined, tmp_path):
 
 
 # ---- files
-
-
-def test_a_missing_file_and_one_of_another_kind_are_refused(tmp_path):
-    path = tmp_path / "robustness.json"
-    with pytest.raises(BadArtifact, match="there is no file"):
-        Robustness.load(path)
-    artifacts.write_json(path, {}, kind="settings")
-    with pytest.raises(BadArtifact, match="it holds 'settings', not 'robustness'"):
-        Robustness.load(path)
 
 
 def test_a_game_refuses_what_it_does_not_know(on_vehicle):

@@ -19,37 +19,42 @@ def grid_set(vehicle):
     return GridSet.from_mask(grid, grid.nodes[:, 1] >= 0)
 
 
-def test_a_critical_set_comes_back(tmp_path):
-    critical = CriticalSet(np.array([[0.1, 0.2], [0.3, 0.4]]), np.array([0, 1]), 0.01, 0.3)
-    critical.save(tmp_path / "c.npz")
-    back = CriticalSet.load(tmp_path / "c.npz")
-    np.testing.assert_array_equal(back.points, critical.points)
-    np.testing.assert_array_equal(back.component, critical.component)
-    assert (back.resolution, back.spacing, back.pieces) == (0.01, 0.3, 2)
-
-
-def test_a_partition_comes_back(tmp_path, vehicle, grid_set):
-    whole = Partition((0, 1), (grid_set, ~grid_set), grid_set.mask)
-    whole.save(tmp_path / "p.npz")
-    back = Partition.load(tmp_path / "p.npz", vehicle)
-    assert back.modes == (0, 1)
-    assert back.grid.counts == whole.grid.counts
-    np.testing.assert_array_equal(back.parts[1].values, whole.parts[1].values)
-    np.testing.assert_array_equal(back.succeeds, whole.succeeds)
-
-
-def test_extended_sets_come_back(tmp_path, vehicle, grid_set):
-    masks = grid_set.mask, ~grid_set.mask
+def results(kind, grid_set):
+    both, masks = (grid_set, ~grid_set), (grid_set.mask, ~grid_set.mask)
     narrow = np.array([[0.3, 0.0]]), np.array([0.1]), np.array([[0, 1]])
-    sets = ExtendedSets((0, 1), (grid_set, ~grid_set), masks, 0.3, 0.1, *narrow)
-    sets.save(tmp_path / "e.npz")
-    back = ExtendedSets.load(tmp_path / "e.npz", vehicle)
-    assert (back.modes, back.horizon, back.eps) == ((0, 1), 0.3, 0.1)
-    np.testing.assert_array_equal(back.between, [[0, 1]])
-    for loaded, kept in zip(back.sets, sets.sets, strict=True):
-        np.testing.assert_array_equal(loaded.values, kept.values)
-    for loaded, kept in zip(back.winning, sets.winning, strict=True):
-        np.testing.assert_array_equal(loaded, kept)
+    points = np.array([[0.1, 0.2], [0.3, 0.4]])
+    return {
+        CriticalSet: lambda: CriticalSet(points, np.array([0, 1]), 0.01, 0.3),
+        Partition: lambda: Partition((0, 1), both, grid_set.mask, (2,)),
+        ExtendedSets: lambda: ExtendedSets((0, 1), both, masks, 0.3, 0.1, *narrow),
+        Maps: lambda: Maps(
+            0.1, np.array([2, 3]), {"policy": np.arange(6, dtype=np.int8), "mine": np.ones(6)}
+        ),
+    }[kind]()
+
+
+@pytest.mark.parametrize(
+    ("kind", "names"),
+    [
+        (CriticalSet, "points component resolution spacing"),
+        (Partition, "modes grid_counts signed_distance succeeds dropped unparted"),
+        (
+            ExtendedSets,
+            "modes grid_counts signed_distance winning horizon eps points room between",
+        ),
+        (Maps, "eps grid_counts map_policy map_mine"),
+    ],
+)
+def test_a_result_comes_back(kind, names, tmp_path, vehicle, grid_set):
+    result = results(kind, grid_set)
+    result.save(tmp_path / "r.npz")
+    with np.load(tmp_path / "r.npz", allow_pickle=False) as file:
+        assert {*file.files} == {"kind", "version", *names.split()}
+    back = kind.load(tmp_path / "r.npz", vehicle)
+    assert str(vars(back)) == str(vars(result))
+    result.save(tmp_path / "kept.npz")
+    back.save(tmp_path / "back.npz")
+    assert (tmp_path / "back.npz").read_bytes() == (tmp_path / "kept.npz").read_bytes()
 
 
 def test_sets_of_another_task_are_refused(tmp_path, circle, grid_set):
@@ -98,25 +103,6 @@ def test_arrays_of_another_shape_or_name_are_named(tmp_path):
     artifacts.write_arrays(tmp_path / "c.npz", arrays, "critical set")
     with pytest.raises(BadArtifact, match="it has no array 'resolution'"):
         CriticalSet.load(tmp_path / "c.npz")
-
-
-def test_maps_come_back(tmp_path):
-    maps = Maps(0.1, np.array([2, 3]), {"policy": np.arange(6, dtype=np.int8), "mine": np.ones(6)})
-    maps.save(tmp_path / "m.npz")
-    with np.load(tmp_path / "m.npz", allow_pickle=False) as file:
-        assert set(file.files) == {
-            "kind",
-            "version",
-            "eps",
-            "grid_counts",
-            "map_policy",
-            "map_mine",
-        }
-    back = Maps.load(tmp_path / "m.npz")
-    assert back.eps == 0.1
-    assert back.map.keys() == maps.map.keys()
-    for name, classes in maps.map.items():
-        np.testing.assert_array_equal(back.map[name], classes)
 
 
 def test_results_that_do_not_fit_together_are_refused(grid_set):

@@ -173,12 +173,6 @@ def test_any_winding_is_the_same_point(case):
         np.testing.assert_allclose(whole.signed_distance(shifted), distance, atol=1e-9)
 
 
-def test_the_distance_is_continuous_over_the_seam():
-    whole = on_grid(RING, arc, 180)
-    seam = whole.signed_distance(np.array([[2 * PI - 1e-9], [0.0], [2 * PI]]))
-    np.testing.assert_allclose(seam, seam[0], atol=1e-6)
-
-
 # ---- grids
 
 
@@ -257,11 +251,13 @@ def test_the_nearest_node_is_the_nearest(case):
     np.testing.assert_allclose(chosen, distance.min(axis=1), atol=1e-9)
 
 
-def test_a_grid_of_another_dimension_or_size_is_refused():
+def test_numbers_that_do_not_fit_a_grid_are_refused():
     with pytest.raises(BadInput, match="2 dimensions"):
         Grid.from_counts(LINE, np.array([3, 3]))
     with pytest.raises(BadInput, match=r"\(5,\).*3 nodes"):
         GridSet(Grid(LINE, (3,)), np.zeros(5))
+    with pytest.raises(BadInput, match="finite"):
+        GridSet(Grid(LINE, (3,)), np.full(3, np.nan))
 
 
 def test_the_values_of_a_set_are_frozen():
@@ -292,12 +288,6 @@ def test_projection_onto_an_empty_set_leaves_points_where_they_are():
     grid = Grid.with_cells(LINE, 10)
     empty, z = GridSet.from_mask(grid, np.zeros(11, dtype=bool)), points(LINE, 5)
     np.testing.assert_array_equal(empty.project(z), z)
-
-
-def test_distances_that_are_no_numbers_are_refused(circle):
-    grid = Grid.with_cells(circle.chart, 20)
-    with pytest.raises(BadInput, match="finite"):
-        GridSet(grid, np.full(20, np.nan))
 
 
 # ---- boxes, for noise

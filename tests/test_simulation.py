@@ -338,22 +338,6 @@ def test_two_controllers_meet_the_same_noise(vehicle):
         np.testing.assert_allclose(a[:common], b[:common], atol=1e-12)
 
 
-def test_the_seed_fixes_the_noise_and_another_changes_it(vehicle):
-    def measured(seed):
-        noise, start = Noise("uniform", 0.1), np.array([0.0, 0.5])
-        return simulate(vehicle, one_way_policy(vehicle), start, noise, seed=seed).measured[:-1]
-
-    np.testing.assert_array_equal(measured(1), measured(1))
-    assert not np.array_equal(measured(1), measured(2))
-
-
-def test_noise_acts_on_the_noisy_columns_only(jumping_arc):
-    noise = (jumping_arc.measured - jumping_arc.z)[:-1]
-    np.testing.assert_array_equal(noise[:, 0], 0.0)
-    np.testing.assert_allclose(np.abs(noise[:, 1]), 0.1, atol=1e-12)
-    assert (jumping_arc.noise, jumping_arc.bound) == ("alternating", 0.1)
-
-
 # ---- bad input
 
 

@@ -723,7 +723,7 @@ def test_runs_do_not_depend_on_how_many_are_played_side_by_side(
         noise = Noise() if kind in ("none", "attack") else Noise(kind, 0.1)
         if kind == "attack":
             rules = Rules(task, loop, 0.1, np.array(task.noisy))
-            programmes = np.random.default_rng(1).integers(len(rules) - 1, size=(9, 3))
+            programmes = np.random.default_rng(1).integers(rules.ahead, size=(9, 3))
             noise = Programmes(task, loop, rules, programmes, 4)
         run = closed_loop(task, loop, z, noise, seed=1, settings=settings)
         found.append((run, getattr(noise, "values", np.zeros(1)), getattr(noise, "danger", 0)))

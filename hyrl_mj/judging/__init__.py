@@ -5,7 +5,7 @@ Behind it are the worst-case game (`game`), what is proved between its nodes (`p
 """
 
 from hyrl_mj.judging.attacks import Attack, Budget, attack, attack_starts
-from hyrl_mj.judging.episodes import NoisyEpisodes, Regions, noisy_episodes
+from hyrl_mj.judging.episodes import Regions, noisy_episodes
 from hyrl_mj.judging.evidence import VerdictSettings, by_kind
 from hyrl_mj.judging.examination import USUAL, Examination, ExamineOptions, Subject, examine
 from hyrl_mj.judging.results import Arrivals, Kind, ModeResult, Retraining, failures
@@ -22,7 +22,6 @@ __all__ = [
     "ExamineOptions",
     "Kind",
     "ModeResult",
-    "NoisyEpisodes",
     "Regions",
     "Retraining",
     "Subject",

@@ -4,22 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 
-from hyrl_mj.errors import BadInput, check_seed
+from hyrl_mj.errors import check_seed
 from hyrl_mj.judging.attacks import Budget, attack, attack_starts, shown_arcs
-from hyrl_mj.judging.episodes import NoisyEpisodes, Regions, check_count, noisy_episodes
-from hyrl_mj.judging.game import MapClass, Maps, Robustness, compare
+from hyrl_mj.judging.episodes import Regions, noisy_episodes
+from hyrl_mj.judging.game import Comparison, EpisodeCount, MapClass, Maps, Robustness, compare
 from hyrl_mj.judging.worst_case import worst_case
 from hyrl_mj.policies import Controller
+from hyrl_mj.ranges import By, Checked, Integer, Number, Optional
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.simulation import AttackSettings, HybridArc, noise_of, usual_kinds
 from hyrl_mj.tasks import Effort, Task
 
 
 @dataclass(frozen=True)
-class ExamineOptions:
+class ExamineOptions(Checked):
     """The options of an examination under noise.
 
     Attributes:
@@ -41,26 +43,21 @@ class ExamineOptions:
     """
 
     eps: float | None = None
-    episodes: int | None = None
+    episodes: Annotated[int | None, Optional(Integer(1, 10**9))] = None
     noise: tuple[str, ...] = ()
     all_coordinates: bool = False
     near_critical: bool = False
-    seed: int = 0
-    attack_starts: int | None = None
-    attack_seconds: float | None = None
-    attack_rounds: int | None = None
+    seed: Annotated[int, By(check_seed)] = 0
+    attack_starts: Annotated[int | None, Optional(Integer(1, 100_000))] = None
+    attack_seconds: Annotated[float | None, Optional(Number(0, 86_400, above=True))] = None
+    attack_rounds: Annotated[int | None, Optional(Integer(1, 100_000))] = None
 
     def budget(self, effort: Effort, exact: bool) -> Budget | None:
         """Returns how long controllers are attacked, or None if they are not.
 
         Raises:
-            BadInput: an impossible time or number of rounds, or both.
+            BadInput: both a time and a number of rounds.
         """
-        most = 100_000  # each keeps signals of a whole episode
-        if self.attack_starts is not None and not 1 <= self.attack_starts <= most:
-            raise BadInput(
-                f"{self.attack_starts} starts cannot be attacked: give a number from 1 to {most:,}"
-            )
         if self.attack_seconds is None and self.attack_rounds is None:
             attacked = self.attack_starts is not None or not exact
             return Budget(rounds=effort.attack_rounds) if attacked else None
@@ -131,7 +128,7 @@ def examine(
         budget: of the attack; by default there is none.
 
     Raises:
-        BadInput: a bound or a number that cannot be used.
+        BadInput: a bound that cannot be used.
     """
     task, points = subject.task, subject.points
     eps = subject.eps if options.eps is None else options.eps
@@ -140,9 +137,6 @@ def examine(
     count = options.episodes
     if count is None and not subject.exact:
         count = subject.effort.episodes
-    check_seed(options.seed)
-    if count is not None:
-        check_count(count)
     # A kind that is named twice would count the same episodes twice.
     kinds = dict.fromkeys(options.noise or usual_kinds(task, eps, everywhere))
     noises = [noise_of(task, kind, eps, everywhere) for kind in kinds]
@@ -154,12 +148,13 @@ def examine(
             subject.curves,
         )  # fmt: skip
     regions = Regions(points, _winnable(subject, maps), options.near_critical)
-    episodes = NoisyEpisodes((), ())
+    counts: tuple[EpisodeCount, ...] = ()
+    comparisons: tuple[Comparison, ...] = ()
     if count is not None:
-        episodes = noisy_episodes(task, regions, subject.controllers, noises, count, options.seed)
-    results = Robustness(
-        eps, everywhere, game, episodes.counts, options.seed, comparisons=episodes.comparisons
-    )
+        counts, comparisons = noisy_episodes(
+            task, regions, subject.controllers, noises, count, options.seed
+        )
+    results = Robustness(eps, everywhere, game, counts, options.seed, comparisons=comparisons)
     if budget is None:
         return Examination(results, maps)
     starts = options.attack_starts or subject.effort.attack_starts

@@ -29,9 +29,10 @@ from hyrl_mj.judging.game import (
     largest_bound,
     lattice_grid,
     share,
+    won_in,
 )
 from hyrl_mj.judging.proof.cells import why_no_cells
-from hyrl_mj.judging.proof.certificate import Certificate, Proved
+from hyrl_mj.judging.proof.certificate import Certificate
 from hyrl_mj.judging.proof.counterexamples import Broken, beaten, find_counterexamples
 from hyrl_mj.judging.proof.replays import replay
 from hyrl_mj.judging.proof.sensed import prove_under
@@ -158,8 +159,9 @@ def _score(certificate: Certificate, name: str, nodes: NodeScore, broken: Broken
         own, some = share(~broken.own[region]), share(~broken.some[region])
         if not region.any():  # a start region thinner than a cell
             own, some = nodes.won, nodes.won_any
-    proved = certificate.wins(name, eps) if name in certificate.answers else Proved()
-    return Score(**vars(nodes), open=open_, **proved._asdict(), not_broken=own, not_broken_any=some)
+    proved = certificate.wins(name, eps) if name in certificate.answers else (None,) * 4
+    values: list[Any] = [*vars(nodes).values(), open_, *proved, own, some]
+    return Score(*values)
 
 
 def _map(certificate: Certificate, name: str, eps: float) -> np.ndarray:
@@ -193,7 +195,7 @@ def _sweep(certificate: Certificate, points: np.ndarray) -> tuple[Curve, Profile
     """Returns the curve up to the game's largest bound, and the noise that points (N, d) of M* bear."""
     bounds = tuple(float(f"{certificate.game.largest * part:.10g}") for part in CURVE)
     game, names = certificate.game, [*certificate.controllers, LIMIT]
-    task, dt = game.task, game.task.dt
+    task = game.task
     along = points[task.may_start(points)]
     at = game.lattice.grid.nearest(along)
     games = [(name, eps) for eps in bounds for name in names]
@@ -207,11 +209,9 @@ def _sweep(certificate: Certificate, points: np.ndarray) -> tuple[Curve, Profile
         rows: list[tuple[float, float, float | None]] = []
         for eps, region in zip(bounds, regions, strict=True):
             value = values[name, eps][:, :-2]
-            first, worst = value[-1], value[:-1].max(axis=0)
-            after = worst[region & (worst < NEVER)]
-            time_any = float(after.max() * dt) if len(after) else None
-            rows.append((share(first[region] < NEVER), share(worst[region] < NEVER), time_any))
-            holds &= first[at] < NEVER
+            first, worst, _, latest = won_in(region, value, task.dt)
+            rows.append((first, worst, latest if worst else None))
+            holds &= value[-1, at] < NEVER
             bears[holds] = eps
         of_cells = [proved[name, eps] for eps in bounds if name in certificate.answers]
         own, some = (tuple(found[i] for found in of_cells) for i in range(2))

@@ -47,13 +47,11 @@ class Rehearsal:
         at = np.arange(self._tried, self._tried + self._count) % len(self._points)
         self._tried += self._count
         z = self._points[at]
-        run = way_runs(self._task, policy, z, quiet=True)
-        lost = (
-            (run.outcome != Outcome.REACHED) & (run.outcome != Outcome.UNSTABLE) & (run.length > 0)
-        )
+        ways, run = way_runs(self._task, policy, z, quiet=True)
+        lost = ~ways.arrived & ways.stable & ways.alive
         self._lost, weight = z[lost], run.length[lost].astype(float)
         self._weight = weight / max(weight.sum(), 1.0)
-        self._deciding = self._between(z, WayRuns.from_rollout(self._task, run))
+        self._deciding = self._between(z, ways)
 
     def _between(self, z: np.ndarray, runs: WayRuns) -> np.ndarray:
         """Returns the middles (k, d) between neighbours among z (n, d) from which runs go different ways."""

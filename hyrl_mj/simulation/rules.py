@@ -120,7 +120,8 @@ class Rules:
     Attributes:
         bound, shares: as above.
         candidates: (c, p) noise that wishes choose from, the first of which is none.
-        all: the rules; the last two are that without noise, and `ahead`.
+        all: the rules.
+        nothing, ahead: the indices of the last two of them: without noise, and by `lookahead`.
         common: indices of the rules that every controller is tried with, in this order.
         own: indices of the rules for a controller with several modes; none for others.
         parts: indices of the rules that programmes of several segments are drawn from.
@@ -153,6 +154,7 @@ class Rules:
         common += _timed((ends or [none])[0], length or task.max_steps, settings)
         self.all = [*common, *own, Rule(RuleKind.NOTHING, none), Rule(RuleKind.AHEAD, none)]
         self.own = np.arange(len(common), len(common) + len(own))
+        self.nothing, self.ahead = len(self.all) - 2, len(self.all) - 1
         # An environment cannot be simulated ahead from the middle of an episode.
         self.lookahead = (
             Lookahead(bound, shares).against(task, controller)
@@ -170,19 +172,6 @@ class Rules:
         self.flip = np.array([rule.flip for rule in self.all])
         self.turns = np.array([rule.kind == RuleKind.TURN for rule in self.all])
         self.wishful = np.array([rule.kind in WISHES for rule in self.all])
-
-    def __len__(self) -> int:
-        return len(self.all)
-
-    @property
-    def nothing(self) -> int:
-        """The rule without noise."""
-        return len(self) - 2
-
-    @property
-    def ahead(self) -> int:
-        """The rule that simulates ahead, which is the last one."""
-        return len(self) - 1
 
     def signs(self, rule: np.ndarray, k: np.ndarray, turned: np.ndarray) -> np.ndarray:
         """Returns the signs (r,) of the noise of rules (r,) at samples k (r,).

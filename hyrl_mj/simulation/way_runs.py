@@ -37,21 +37,6 @@ class WayRuns(Rows):
     direction: np.ndarray | None
     passing: Passing | None
 
-    @staticmethod
-    def from_rollout(task: Task, rollout: Rollout) -> WayRuns:
-        """Returns the ways of the runs of a rollout, of `way_runs`."""
-        outcome = rollout.outcome
-        arrived = outcome == Outcome.REACHED
-        late = (outcome == Outcome.STALLED) | (outcome == Outcome.RUNNING)
-        return WayRuns(
-            rollout.length > 0,
-            arrived,
-            arrived | (late & task.gives_direction),
-            outcome != Outcome.UNSTABLE,
-            task.direction(rollout.path) if task.gives_direction else None,
-            rollout.passing,
-        )
-
     def __len__(self) -> int:
         return len(self.arrived)
 
@@ -87,6 +72,19 @@ def policy_runs(task: Task, policy: Policy, z0: np.ndarray, **settings: Any) -> 
     return closed_loop(task, PolicyController(policy), z0, settings=LoopSettings(**settings))
 
 
-def way_runs(task: Task, policy: Policy, z: np.ndarray, **settings: Any) -> Rollout:
-    """Returns the runs of `policy_runs`, with all that `WayRuns.from_rollout` has to know of them."""
-    return policy_runs(task, policy, z, passing=not task.gives_direction, **settings)
+def way_runs(task: Task, policy: Policy, z: np.ndarray, **settings: Any) -> tuple[WayRuns, Rollout]:
+    """Returns which ways the runs of `policy_runs` go, and these runs."""
+    own = task.gives_direction
+    rollout = policy_runs(task, policy, z, passing=not own, **settings)
+    outcome = rollout.outcome
+    arrived = outcome == Outcome.REACHED
+    late = (outcome == Outcome.STALLED) | (outcome == Outcome.RUNNING)
+    ways = WayRuns(
+        alive=rollout.length > 0,
+        arrived=arrived,
+        shows=arrived | (late & own),
+        stable=outcome != Outcome.UNSTABLE,
+        direction=task.direction(rollout.path) if own else None,
+        passing=rollout.passing,
+    )
+    return ways, rollout

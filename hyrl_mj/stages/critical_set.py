@@ -12,7 +12,7 @@ from hyrl_mj.files.artifacts import Saved
 from hyrl_mj.learning import WaySettings
 from hyrl_mj.policies import Policy
 from hyrl_mj.sets import Nodes, covering
-from hyrl_mj.simulation import WayRuns, policy_runs, way_runs
+from hyrl_mj.simulation import policy_runs, way_runs
 from hyrl_mj.stages.meeting import ranges
 from hyrl_mj.stages.search import critical_points
 from hyrl_mj.tasks import SEARCHES, Task
@@ -140,7 +140,7 @@ def _by_rods(
     if not len(centre):
         return centre
     ends = _ends(task, centre, axis, length).reshape(-1, d)
-    runs = WayRuns.from_rollout(task, way_runs(task, policy, ends))
+    runs, _ = way_runs(task, policy, ends)
     first, second = np.split(np.arange(2 * len(centre)), 2)
     works = runs.usable
     return centre[runs[first].differ(runs[second]) & works[first] & works[second]]

@@ -179,8 +179,8 @@ class ModeGround(ABC):
         """Judges a policy; `twin` is the share that its mirror image wins, if it is the image of one."""
 
     @abstractmethod
-    def share_won(self, policy: Policy, judged: Judged) -> float:
-        """Returns the share that a policy wins, as in `ModeResult`, from what `judge` said of it."""
+    def won(self, policy: Policy) -> float:
+        """Returns the share that a policy wins, as in `ModeResult`."""
 
     @cached_property
     def selected(self) -> np.ndarray:
@@ -206,10 +206,6 @@ class ModeGround(ABC):
     def suffices(self, policy: Policy) -> bool:
         """Returns whether no other training is needed."""
         return self.judged(policy).suffices
-
-    def won(self, policy: Policy) -> float:
-        """Returns the share that a policy wins, as in `ModeResult`."""
-        return self.share_won(policy, self.judged(policy))
 
     def won_by_image(self, image: MlpPolicy, won: float) -> float | None:
         """Returns the share that a mirror image wins; None if it is too little.
@@ -285,7 +281,7 @@ class ByGame(ModeGround):
         score = 0.0, -float(max(delay, miss))
         return Judged(score, score >= self.enough)
 
-    def share_won(self, policy: Policy, judged: Judged) -> float:
+    def won(self, policy: Policy) -> float:
         _, moves = self._moves(policy)
         value = game.solve(moves, self.task.max_steps)[0, :-2]
         return float((value[self.nodes] < game.NEVER).mean())
@@ -453,7 +449,8 @@ class ByEpisodes(Episodes):
         """Returns that the play after those survived loses some of its starts (k,) bool, at nodes (l,)."""
         return Judged((float(survived), -float(lost.mean())), False, nodes, np.ones(len(nodes)))
 
-    def share_won(self, policy: Policy, judged: Judged) -> float:
+    def won(self, policy: Policy) -> float:
+        judged = self.judged(policy)
         if not len(judged.lost):
             return 1.0
         if judged.score[0] == len(self.plays):  # it loses under the attack alone
@@ -504,11 +501,12 @@ class ByAttack(ByEpisodes):
         noisy = self.by_plays(policy, self.plays)
         return replace(noisy, score=(1.0, *noisy.score))
 
-    def share_won(self, policy: Policy, judged: Judged) -> float:
+    def won(self, policy: Policy) -> float:
         """Returns the share that a policy wins, which is no larger than what the attack leaves of it."""
-        if judged.score[:2] == self.enough[:2]:
+        score = self(policy)
+        if score[:2] == self.enough[:2]:
             return 1.0  # the same episodes
-        return min(judged.score[0], self.share(policy, self.plays))
+        return min(score[0], self.share(policy, self.plays))
 
 
 class ByShare(Episodes):
@@ -526,8 +524,8 @@ class ByShare(Episodes):
         share = self.share(policy, [(len(self.batches) - 1, kind) for kind in KINDS[:-1]])
         return Judged((share,), twin is None or share >= twin - self.settings.alike)
 
-    def share_won(self, policy: Policy, judged: Judged) -> float:
-        return judged.score[0]
+    def won(self, policy: Policy) -> float:
+        return self(policy)[0]
 
     def note_losses(self, policy: Policy) -> None:
         """All starts of a task need no such note."""

@@ -16,7 +16,7 @@ from hyrl_mj.judging.game import NEVER, Limit
 from hyrl_mj.learning import WaySettings
 from hyrl_mj.policies import Policy
 from hyrl_mj.sets import GridSet, Nodes, check_points, resolving, shortest_ways
-from hyrl_mj.simulation import WayRuns, policy_runs, way_runs
+from hyrl_mj.simulation import policy_runs, way_runs
 from hyrl_mj.stages.refinement import refined, thinned
 from hyrl_mj.stages.ways import HomotopyClasses
 from hyrl_mj.tasks import ANY, Outcome, Task, number_of
@@ -142,9 +142,7 @@ def make_partition(
     points = check_points(task.chart, points, task.name)
     grid = resolving(task.chart, cells, points, task.noise_in_chart(max(eps, 1e-6)))
     simulated, neighbours = thinned(task, grid)
-    first = WayRuns.from_rollout(
-        task, way_runs(task, policy, grid.nodes[simulated], label="partition")
-    )
+    first, _ = way_runs(task, policy, grid.nodes[simulated], label="partition")
     nodes, near = grid.nodes[simulated], None
     if first.passing is not None and eps and len(points):
         width = _strip_width(task, eps, longest_hop(task, policy, grid))
@@ -163,9 +161,7 @@ def make_partition(
         """Returns the modes of nodes, whether their runs work, and whether they arrive: (k, Q + 2)."""
         runs = first
         if not np.array_equal(rows, simulated):
-            runs = WayRuns.from_rollout(
-                task, way_runs(task, policy, grid.nodes[rows], label="partition")
-            )
+            runs, _ = way_runs(task, policy, grid.nodes[rows], label="partition")
         return np.column_stack([ways.members(runs), ways.works(runs), runs.arrived])
 
     everywhere, columns = np.ones(grid.size, dtype=bool), len(ways.modes) + 2

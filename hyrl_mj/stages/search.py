@@ -34,8 +34,8 @@ def critical_points(
         neighbours: (k,), (k,) indices of starts that lie next to each other.
         cell: the usual distance between two neighbours, in scaled units.
     """
-    rollout = way_runs(task, policy, nodes, label="critical set")
-    runs, paths = WayRuns.from_rollout(task, rollout), _paths(task, rollout)
+    runs, rollout = way_runs(task, policy, nodes, label="critical set")
+    paths = _paths(task, rollout)
     ways = HomotopyClasses.from_runs(task, runs, neighbours, settings=settings)
     works = ways.works(runs)
     if not works.any():
@@ -138,8 +138,8 @@ def _bisected(
         finished = 0 if len(left) else finished + 1
         if len(left):
             middle = (a.z[left] + c[left]) / 2
-            rollout = way_runs(task, policy, middle)
-            found = _Side(middle, WayRuns.from_rollout(task, rollout), _paths(task, rollout))
+            of_middle, rollout = way_runs(task, policy, middle)
+            found = _Side(middle, of_middle, _paths(task, rollout))
             works = ways.works(found.runs)
             same = works & ~found.runs.differ(a.runs[left])
             other = works & ~same

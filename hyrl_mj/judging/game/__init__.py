@@ -41,7 +41,7 @@ from hyrl_mj.judging.game.result import (
     WinningShares,
     percent,
 )
-from hyrl_mj.judging.game.scores import CURVE, Game, largest_bound, share, worst_signal
+from hyrl_mj.judging.game.scores import CURVE, Game, largest_bound, share, won_in, worst_signal
 from hyrl_mj.judging.game.solver import (
     FIRST,
     LOST,

@@ -115,18 +115,12 @@ class Game:
         moves = self.moves(name, eps)
         value = self._value(name, moves, eps)[:, :-2]
         region = self.starts & self.winnable(eps)
-        own, worst = value[-1, region], value[:-1, region].max(axis=0, initial=0)
         still = lasting(moves) & ~self.lattice.failed
-        nodes, dt = self.lattice.grid.nodes, self.task.dt
-        return NodeScore(
-            eps=eps,
-            winnable=float(region.sum() / max(self.starts.sum(), 1)),
-            won=share(own < NEVER),
-            won_any=share(worst < NEVER),
-            time=float(own[own < NEVER].max(initial=0) * dt),
-            time_any=float(worst[worst < NEVER].max(initial=0) * dt),
-            excursion=float(self.task.miss(nodes[still]).max()) if still.any() else None,
-        )
+        excursion = None
+        if still.any():
+            excursion = float(self.task.miss(self.lattice.grid.nodes[still]).max())
+        winnable = float(region.sum() / max(self.starts.sum(), 1))
+        return NodeScore(eps, winnable, *won_in(region, value, self.task.dt), excursion)
 
     def _value(self, name: str, moves: Moves, eps: float) -> np.ndarray:
         value = solve(moves, self.task.max_steps)
@@ -191,6 +185,17 @@ class Game:
 def share(won: np.ndarray) -> float:
     """Returns the share of (n,) bool that is true; 0 if n is 0, as nothing is won where nothing can be."""
     return float(won.mean()) if len(won) else 0.0
+
+
+def won_in(region: np.ndarray, value: np.ndarray, dt: float) -> tuple[float, float, float, float]:
+    """Returns what is won of a region (N,) bool by a value of the game (modes + 1, N).
+
+    These are the shares that are won if the controller picks its start mode, and from every start mode; and
+    the latest arrivals [s] from these.
+    """
+    own, worst = value[-1, region], value[:-1, region].max(axis=0, initial=0)
+    latest, latest_any = (float(x[x < NEVER].max(initial=0) * dt) for x in (own, worst))
+    return share(own < NEVER), share(worst < NEVER), latest, latest_any
 
 
 def worst_signal(

@@ -4,24 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 
-from hyrl_mj.judging.game import NEVER, Game, Moves, Places, share, solve
+from hyrl_mj.judging.game import Game, Moves, Places, solve, won_in
 from hyrl_mj.judging.proof.affine import Unbounded
 from hyrl_mj.judging.proof.answers import BoundedAnswers
 from hyrl_mj.judging.proof.cells import Cells
 from hyrl_mj.policies import Controller
-
-
-class Proved(NamedTuple):
-    """What is proved of a controller at a noise bound, as in `Score`; None of one that is not bounded."""
-
-    proved: float | None = None
-    proved_any: float | None = None
-    proved_time: float | None = None
-    proved_time_any: float | None = None
 
 
 @dataclass(frozen=True)
@@ -95,15 +85,9 @@ class Certificate:
         nodes = self.game.starts & self.game.winnable(eps)
         return nodes if self.cells is None else self.cells.all_corners(nodes)
 
-    def wins(self, name: str, eps: float) -> Proved:
-        """Returns what is proved of a controller; zeros where no cell is winnable."""
-        value, region = self.value(name, eps)[:, :-2], self.region(eps)
-        if not region.any():  # nothing is winnable, or the start region is thinner than a cell
-            return Proved(0.0, 0.0, 0.0, 0.0)
-        own, worst = value[-1, region], value[:-1, region].max(axis=0, initial=0)
-        latest, latest_any = (float(x[x < NEVER].max(initial=0)) for x in (own, worst))
-        dt = self.game.task.dt
-        return Proved(share(own < NEVER), share(worst < NEVER), latest * dt, latest_any * dt)
+    def wins(self, name: str, eps: float) -> tuple[float, float, float, float]:
+        """Returns what is proved of a controller, as `won_in`; zeros where no cell is winnable."""
+        return won_in(self.region(eps), self.value(name, eps)[:, :-2], self.game.task.dt)
 
 
 def in_order(parts: Sequence[tuple[np.ndarray, ...]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
