@@ -356,7 +356,7 @@ STAYS = {
 OTHERWISE = {
     "a second state": (Twin, {}, r"step\(\) of Twin leads to one x, wherever .* by a second one"),
     "a fence that is drawn": (
-        Fence, {}, "draws home, or sets it to the place that it leads to, .* first step",
+        Fence, {}, "draws home, .* first step",
     ),
     "a region": (FenceByRegion, {}, r"draws region|notes where it leads to \(region"),
     "a load": (Tied, XY, "or limits of tendons tie the robot of Tied"),

@@ -401,8 +401,7 @@ def _learn_bounds(instance: Instance, met: np.ndarray, begun: np.ndarray) -> Non
     )
     if not np.ptp(begun, axis=0).any():
         found["starts"] += (
-            ", one place, so no reset shows what else would be elsewhere at other starts; trials looked at "
-            "setpoints, ties and attributes that hold this place"
+            ", one place, so no reset shows what else would be elsewhere at other starts; trials led it there"
         )
     start_low, start_high = low, high
     if given.starts == "reset":
