@@ -159,8 +159,7 @@ class _Lead:
     """Leads a reset of an instance, within a block, to a start: what holds its place holds that of the start.
 
     Homes do so until the reset has ended, MuJoCo's state and variables of functions from before each line of
-    Python on, and when it has ended attributes that hold the place in runs, or that it has set to the usual
-    one.
+    Python on, and attributes when it has ended.
 
     Args:
         instance: the environment.
@@ -179,20 +178,14 @@ class _Lead:
         self._instance, self._place, self._holders = instance, place, holders
         self._usual = instance.spec.state[instance.spec.places]
         self._homes, self._moved, self._lines = homes, ExitStack(), 0
-        # Attributes that hold the usual place hold another one until the end, if the reset does not set them.
-        self._marked, self._mark = dict[str, np.ndarray](), self._usual + 1 / 3
 
     def __enter__(self) -> None:
-        inner, known = self._instance.inner, _numbers_of_resets(self._instance)
+        known = _numbers_of_resets(self._instance)
         is_position = [c.kind == "qpos" for c in self._instance.spec.coordinates]
         by = (self._place - self._usual)[is_position]
         for name in self._homes:
             if name in known:  # a reset may hold it otherwise than a constructor
                 self._moved.enter_context(_moved(*known[name], by))
-        if self._holders is not None:
-            where = {n: _holding(numbers, self._usual) for n, numbers in numbers_in(inner).items()}
-            self._marked = {name: at for name, at in where.items() if (at >= 0).any()}
-            set_numbers(inner, {n: _numbers_at(self._mark, at) for n, at in self._marked.items()})
         self._instance.lead = self
 
     def __exit__(self, *_: Any) -> None:
@@ -227,30 +220,22 @@ class _Lead:
     def end(self) -> None:
         """Ends with a reset, before anything is observed."""
         self._moved.close()
-        inner, marked, self._marked = self._instance.inner, self._marked, {}
-        values = {name: _numbers_at(self._place, at) for name, at in (self._holders or {}).items()}
-        for name, numbers in numbers_in(inner).items() if marked else ():
-            at = marked.get(name, np.empty(0))
-            if np.array_equal(_holding(numbers, self._usual), at):  # the reset has set it
-                values[name] = _numbers_at(self._place, at)
-            elif np.array_equal(_holding(numbers, self._mark), at):
-                values[name] = _numbers_at(self._usual, at)
-        set_numbers(inner, values)
-
-
-def _numbers_at(place: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Returns the coordinates of a place (d,) that `at` (k,) tells, NaN where it tells none."""
-    return np.where(at < 0, np.nan, place[at])
+        inner, holders = self._instance.inner, self._holders or {}
+        at_end = numbers_in(inner) if holders else {}
+        same = {n: at for n, at in holders.items() if len(at) == len(at_end.get(n, ()))}
+        set_numbers(inner, {n: _numbers_at(self._place, at) for n, at in same.items()})
 
 
 def _holding(numbers: np.ndarray, place: np.ndarray) -> np.ndarray:
     """Returns which coordinate of a place (d,) each of some numbers (k,) is: (k,) int, -1 of none.
 
-    Halves and whole numbers may be anything, unless all of the place stands in a row.
+    Halves and whole numbers may be anything, unless all of the place stands in a row. So may one of several.
     """
     found, d = np.full(len(numbers), -1), len(place)
-    for j in np.flatnonzero(2 * place != np.rint(2 * place)):
-        found[numbers == place[j]] = j
+    odd = np.flatnonzero(2 * place != np.rint(2 * place))
+    if len(numbers) == 1 or (len(odd) == d and np.isin(place, numbers).all()):
+        for j in odd:
+            found[numbers == place[j]] = j
     if d > 1 and place.any():
         for i in np.flatnonzero(numbers == place[0]):
             if np.array_equal(numbers[i : i + d], place):
@@ -259,7 +244,10 @@ def _holding(numbers: np.ndarray, place: np.ndarray) -> np.ndarray:
 
 
 def _holders(instance: Instance) -> dict[str, np.ndarray]:
-    """Returns which coordinates of the place attributes hold throughout runs: (k,) int, -1 of none."""
+    """Returns which coordinates of the place attributes hold, by name: (k,) int, -1 of none.
+
+    They hold it throughout runs, or resets set them to the usual place whatever they have held before.
+    """
     spec, rng, rows, places = instance.spec, np.random.default_rng(14), [], []
     for _ in range(EPISODES):
         instance.reset()
@@ -275,7 +263,28 @@ def _holders(instance: Instance) -> dict[str, np.ndarray]:
         is_held = same.all(axis=0) & moves  # (k, d)
         if is_held.any():
             found[name] = np.where(is_held.any(axis=1), is_held.argmax(axis=1), -1)
+    usual = spec.state[spec.places]
+    other = usual + 1 / 3
+    with suppress(BadInput):  # it may not be able to begin from elsewhere
+        instance.reset()
+        before = _holding_in(instance, usual)
+        set_numbers(instance.inner, {n: _numbers_at(other, at) for n, at in before.items()})
+        instance.reset()
+        now, kept = (_holding_in(instance, place) for place in (usual, other))
+        found |= {n: at for n, at in now.items() if np.array_equal(before.get(n, ()), at)}
+        set_numbers(instance.inner, {n: _numbers_at(usual, at) for n, at in kept.items()})
     return found
+
+
+def _holding_in(instance: Instance, place: np.ndarray) -> dict[str, np.ndarray]:
+    """Returns which coordinates of a place (d,) attributes hold, by name; see `_holding`."""
+    found = {n: _holding(numbers, place) for n, numbers in numbers_in(instance.inner).items()}
+    return {name: at for name, at in found.items() if (at >= 0).any()}
+
+
+def _numbers_at(place: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Returns the coordinates of a place (d,) that `at` (k,) tells, NaN where it tells none."""
+    return np.where(at < 0, np.nan, place[at])
 
 
 def _homes(spec: EnvironmentSpec) -> list[str]:
