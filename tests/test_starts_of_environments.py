@@ -12,7 +12,7 @@ from hyrl_mj import BadInput, from_gymnasium
 pytestmark = pytest.mark.slow  # a second for each environment
 MOTORS = XML[XML.index("<actuator>") + 10 : XML.index("</actuator>")]
 SERVOS = "".join(
-    f'<{{kind}} name="to_{axis}" joint="{axis}" kp="20" {{limit}}="-3 3"/>' for axis in "xy"
+    f'<position name="to_{axis}" joint="{axis}" kp="20" ctrlrange="-3 3"/>' for axis in "xy"
 )
 
 
@@ -28,7 +28,7 @@ class OnePlace(Puck):
 class Setpoint(Puck):
     """Its actions move the setpoints of servos."""
 
-    xml = XML.replace(MOTORS, SERVOS.format(kind="position", limit="ctrlrange"))
+    xml = XML.replace(MOTORS, SERVOS)
 
     def begin(self, place):
         self.data.ctrl[:] = place
@@ -42,13 +42,6 @@ class Centred(Setpoint):
 
     def first(self):
         return np.array([0.0, 1.0])
-
-
-class Integrated(OnePlace):
-    xml = XML.replace(MOTORS, SERVOS.format(kind="intvelocity", limit='ctrlrange="-1 1" actrange'))
-
-    def begin(self, place):
-        self.data.act[:] = place
 
 
 class Fence(OnePlace):
@@ -105,16 +98,6 @@ class Speeding(Home):
     def crashed(self):
         moved, self.before = np.linalg.norm(self.data.qpos - self.before), self.data.qpos.copy()
         return bool(moved > 0.5)
-
-
-class FenceByDistance(Fence):
-    """It notes how far the goal was, and crashes farther away from it."""
-
-    def begin(self, place):
-        self.most = float(np.linalg.norm(place - GOAL))
-
-    def crashed(self):
-        return self.away(GOAL) > self.most + 1.0
 
 
 class FenceByRegion(Puck):
@@ -232,8 +215,8 @@ class Renamed(AtHome):
         self.last, self.path = None, []
 
 
-class Furthest(OnePlace):
-    """It notes how near to the goal it has been, first at a place that a variable holds."""
+class Written(OnePlace):
+    """The place stands in the code of its reset, and it notes how near to the goal it has been since."""
 
     def begin(self, place):
         self.best = float(np.linalg.norm(place - GOAL))
@@ -242,10 +225,6 @@ class Furthest(OnePlace):
         off = self.away(GOAL)
         self.best = min(self.best, off)
         return off > self.best + 0.5
-
-
-class Written(Furthest):
-    """The place stands in the code of its reset."""
 
     def reset(self, *, seed=None, options=None):
         gym.Env.reset(self, seed=seed)
@@ -267,6 +246,20 @@ class Walked(Written):
         self.walked += float(np.hypot(x - self.x, y - self.y))
         self.x, self.y = x, y
         return self.walked > 3.0
+
+
+class Twice(AtHome):
+    """Its place stands twice in its code, the second time as what it notes."""
+
+    def reset(self, *, seed=None, options=None):
+        gym.Env.reset(self, seed=seed)
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:], self.home = [-1.4, 0.1], (-1.4, 0.1)
+        mujoco.mj_forward(self.model, self.data)
+        return self._get_obs(), {}
+
+    def crashed(self):
+        return self.away(self.home) > 1.0
 
 
 class Walking(Written):
@@ -336,13 +329,12 @@ STAYS = {
     "a closure": (HomeInAClosure, {}, r"away.place\)"),
     "a whole number": (HomeOfWholeNumbers, {}, r"line\)"),
     "a key": (HomeOfAKey, {}, r"line\)"),
-    "a distance of a variable": (Furthest, {}, "best"),
     "a distance in code": (Written, {}, r"best\)"),
+    "numbers that stand twice": (Twice, {}, r"home\)"),
     "numbers": (Walked, {}, r"x, y\)"),
     "a place of its own": (Walking, {}, r"place\)"),
     "a setpoint": (Setpoint, SEED, r"ctrl\[0\], ctrl\[1\]\)"),
     "a setpoint at zero": (Centred, {}, r"ctrl\[0\], ctrl\[1\]\)"),
-    "an activation": (Integrated, {}, r"act\[0\], act\[1\]\)"),
     "a fence": (Fence, SEED, r"home\)"),
     "a fence in a box": (Fence, SEED | {"starts": "reset"}, r"home\)"),
     "a fence at one place": (FenceAtOnePlace, {}, r"home\)"),
@@ -350,13 +342,12 @@ STAYS = {
     "what matters late": (Late, {"steps": 200}, ".*share"),
     "a leash": (Leashed, {"steps": None}, r"home\)"),
     "the place before": (Speeding, {"steps": None}, r"before\)"),
-    "a radius": (FenceByDistance, SEED, r"most\)"),
     "a marker": (FenceByMarker, SEED, r"site_pos of its model\)"),
 }
 OTHERWISE = {
     "a second state": (Twin, {}, r"step\(\) of Twin leads to one x, wherever .* by a second one"),
     "a fence that is drawn": (
-        Fence, {}, "draws home, or sets it to the place that it leads to, .* first step",
+        Fence, {}, "draws home, .* first step",
     ),
     "a region": (FenceByRegion, {}, r"draws region|notes where it leads to \(region"),
     "a load": (Tied, XY, "or limits of tendons tie the robot of Tied"),
@@ -374,8 +365,7 @@ TABLE = OTHERWISE | {
 
 
 # What differs from another one in where it notes its place alone.
-TOO = "a whole number", "a distance of a variable", "numbers", "a place of its own", "an activation"
-TOO += "a fence in a box", "a fence at one place", "the place before", "a radius", "a rope"
+TOO = "a whole number", "a fence in a box", "a fence at one place", "the place before", "a rope"
 
 
 @pytest.mark.parametrize(

@@ -150,11 +150,16 @@ def set_numbers(inner: Any, values: Mapping[str, np.ndarray]) -> None:
     """Sets attributes of an environment to numbers (k,), by name; what is NaN stays as it is."""
     for name, owner, key, numbers in [*_numbers(inner)]:
         if name in values:
-            old, new = value_at(owner, key), np.where(np.isnan(values[name]), numbers, values[name])
-            if isinstance(old, np.ndarray) and old.flags.writeable and old.dtype.kind in "biuf":
-                old[...] = new.reshape(old.shape)  # it may be known by several names
-            else:
-                put_at(owner, key, like(old, new))
+            put_numbers(owner, key, np.where(np.isnan(values[name]), numbers, values[name]))
+
+
+def put_numbers(owner: Any, key: Any, numbers: np.ndarray) -> None:
+    """Puts numbers (k,) into the value that `value_at` finds, which keeps its form."""
+    old = value_at(owner, key)
+    if isinstance(old, np.ndarray) and old.flags.writeable and old.dtype.kind == "f":
+        old[...] = numbers.reshape(old.shape)  # it may be known by several names
+    else:
+        put_at(owner, key, like(old, numbers))
 
 
 def _numbers(inner: Any) -> Iterator[tuple[str, Any, Any, np.ndarray]]:

@@ -11,7 +11,7 @@ from hyrl_mj.errors import BadInput
 from hyrl_mj.gym_import.coordinates import own_of
 from hyrl_mj.gym_import.fingerprint import Fingerprint, differing
 from hyrl_mj.gym_import.instance import Instance
-from hyrl_mj.gym_import.resets import Resets, follows
+from hyrl_mj.gym_import.resets import Resets
 from hyrl_mj.gym_import.trials import EPISODES, HELD, SAMPLES
 
 # Resets whose runs are compared, beside those that bring rare values.
@@ -51,12 +51,10 @@ def check_draws(instance: Instance, resets: Resets, met: np.ndarray) -> str:
             n: 0.1 for n in left if n.startswith(("qpos[", "qvel[", "mocap_pos[", "userdata["))
         }:
             how = f"with values as {json.dumps({'pinned': dict(list(positions.items())[:4])})}"
-        of_place = all(follows(instance, resets, n) for n in left)
-        noted = ", or sets it to the place that it leads to" if of_place else ""
-        step = ", or let the first step() note the place" if of_place else ""
         raise BadInput(
-            f"each reset of {name} draws {', '.join(left[:8])}{noted}, and what is to be done depends on it: "
-            f'pin it, {how}, or as the reset with a seed draws it as {{"seed": 0}}{step}'
+            f"each reset of {name} draws {', '.join(left[:8])}, and what is to be done depends on it: "
+            f'pin it, {how}, or as the reset with a seed draws it as {{"seed": 0}}; or let the first step() '
+            "note what follows the place that a reset leads to"
         )
     if instance.draws_globally and (left or kept):
         raise BadInput(

@@ -69,8 +69,8 @@ class Instance:
         start: the state of MuJoCo to which the innermost reset has to lead, below wrappers.
         tamper: changes, in a trial, all but the observation before wrappers get it; these may then write to a
             state that noise has moved, too.
-        noted: changes, in a trial, what resets note.
-        follow: in a trial, is told of each line of Python that a reset takes, as by `sys.settrace`.
+        lead: in a trial, is told of each line of Python that a reset takes, as by `sys.settrace`, and of its
+            end.
         own: for one that goes on from episode to episode as its user's does: the places in a state of what a
             start decides. All else is as its resets leave it, and after the first these have a seed only
             where what they draw is pinned by it.
@@ -117,8 +117,7 @@ class Instance:
         self._samples = 0
         self._placed: mujoco.MjData | None = None
         self.tamper: Callable[[tuple[Any, ...]], tuple[Any, ...]] | None = None
-        self.noted: Callable[[], None] | None = None
-        self.follow: Any = None
+        self.lead: Any = None
         self.veiled, self._noise = False, np.empty(0)
         if self.is_wrapped:
             self._put_in()
@@ -150,8 +149,8 @@ class Instance:
         given_options = {"options": options} if options else {}
         before, tracer = global_state(), sys.gettrace()
         try:
-            if self.follow is not None:
-                sys.settrace(self.follow)
+            if self.lead is not None:
+                sys.settrace(self.lead)
             result = self.env.reset(seed=seed, **given_options)
         except HyrlError:
             raise
@@ -162,7 +161,7 @@ class Instance:
                 f"{'change its options of reset' if given else self._repair(error)}"
             ) from error
         finally:
-            if self.follow is not None:
+            if self.lead is not None:
                 sys.settrace(tracer)
         if not isinstance(result, tuple) or len(result) != 2:
             raise BadInput(
@@ -229,8 +228,8 @@ class Instance:
         if self.own is not None:
             given, state = state, self.physics.read()
             state[self.own] = given[self.own]
-        if self.noted is not None:
-            self.noted()
+        if self.lead is not None:
+            self.lead.end()
         self.physics.write(state)
         self.inner_seen, self._at_start, self._samples = self.watched(), True, 0
 
@@ -640,7 +639,6 @@ class Instance:
 
 def renewed(instance: Instance) -> Instance:
     """Returns what can play another run: an instance, or a new one if something outlasts its resets."""
-    instance.noted = instance.follow = None
     if instance.renew():
         instance = Instance(instance.spec)
         instance.renew()  # what it is like when it is new

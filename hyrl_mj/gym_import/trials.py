@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
+from inspect import unwrap
+from itertools import chain
+from types import FrameType, FunctionType
 from typing import Any
 
 import numpy as np
@@ -29,65 +32,44 @@ PLACES, AWAY, FAR = 64, 2, 5
 def observer_of(instance: Instance) -> str:
     """Returns the name of what computes what an environment observes; raises `BadInput` if nothing does."""
     rng, space = np.random.default_rng(0), instance.inner.observation_space
-    at_reset = later = observers(instance.env)
-
-    def agreeing(names: dict[str, Any]) -> dict[str, Any]:
-        seen = flat(instance.inner_seen, space)
-        with kept_generators():  # one that is no observer may draw
-            return {name: get for name, get in names.items() if _agrees(get, seen, space)}
-
+    left = observers(instance.env)
     for seed in range(EPISODES):
         instance.reset(seed)
+        runs: Iterable[Any] = instance.wander(rng, SAMPLES, HELD)
         if not instance.spec.description.pinned:  # else it was pinned after that observation
-            at_reset = agreeing(at_reset)
-        for _ in instance.wander(rng, SAMPLES, HELD):
-            later = agreeing(later)
-    left = {name: get for name, get in later.items() if name in at_reset}
-    if later and not left:
-        raise BadInput(
-            f"reset() of {instance.name} returns what is not observed in the state that it leads to: let it "
-            "call mj_forward before it observes, and let no wrapper move the robot in its reset()"
-        )
+            runs = chain([None], runs)
+        for _ in runs:
+            seen = flat(instance.inner_seen, space)
+            with kept_generators():  # one that is no observer may draw
+                left = {name: get for name, get in left.items() if _agrees(get, seen, space)}
     if not left:
         raise BadInput(
             f"{instance.name} has no method that computes what it observes in its present state, so nothing "
             "is known of what it would observe under noise: give it one named _get_obs, without arguments, "
-            "whose answer step() and reset() return as it is"
+            "whose answer step() and reset() return as it is; let reset() call mj_forward before it "
+            "observes, and let no wrapper move the robot in its reset()"
         )
     return _called(instance, left) or next(iter(left))
 
 
 def _called(instance: Instance, names: Iterable[str]) -> str:
     """Returns which of some methods of the environment a step calls last, outside of others; "" if none."""
-    inner, within, last = instance.inner, 0, ""
+    within, last, before = 0, "", sys.getprofile()
+    methods = {name: getattr(type(instance.inner), name, None) for name in names}
+    codes = {unwrap(m).__code__: n for n, m in methods.items() if isinstance(m, FunctionType)}
 
-    def watched(name: str, own: Any) -> Any:
-        def method(*arguments: Any, **options: Any) -> Any:
-            nonlocal within, last
-            if not within:
-                last = name
-            within += 1
-            try:
-                return own(*arguments, **options)
-            finally:
-                within -= 1
+    def watch(frame: FrameType, event: str, _: Any) -> None:
+        nonlocal within, last
+        if event in ("call", "return") and frame.f_code in codes:
+            last = last if within else codes[frame.f_code]
+            within += 1 if event == "call" else -1
 
-        return method
-
-    replaced = []
-    for name in names:
-        # What is made of several methods, or put in already, stays as it is.
-        if hasattr(type(inner), name) and name not in getattr(inner, "__dict__", {name: None}):
-            with suppress(Exception):  # it may allow no attributes
-                setattr(inner, name, watched(name, getattr(inner, name)))
-                replaced.append(name)
+    instance.reset()
+    sys.setprofile(watch)
     try:
-        instance.reset()
-        last = ""
         instance.stepped(instance.drawn(np.random.default_rng(0)))
     finally:
-        for name in replaced:
-            delattr(inner, name)
+        sys.setprofile(before)
     return last
 
 

@@ -18,7 +18,7 @@ from hyrl_mj.errors import BadInput
 from hyrl_mj.gym_import.attributes import held, put_at, taken_apart, value_at
 from hyrl_mj.gym_import.coordinates import own_of
 from hyrl_mj.gym_import.instance import Instance, Seen, renewed, to_end
-from hyrl_mj.gym_import.observations import flat
+from hyrl_mj.gym_import.observations import flat, shaped
 from hyrl_mj.gym_import.resets import SAME
 from hyrl_mj.gym_import.specification import Derived, EnvironmentSpec
 from hyrl_mj.gym_import.trials import EPISODES, HELD, PLACES, SAMPLES
@@ -47,7 +47,6 @@ class _Sensor:
     def __init__(self, instance: Instance):
         self.instance = instance
         self.offset, self.given = np.zeros(instance.spec.dimension), list[np.ndarray]()
-        self._own, self._within = getattr(instance.inner, instance.spec.observer), False
 
     def put(self, state: np.ndarray) -> bool:
         """Begins at a state (S,) of MuJoCo; returns whether that is free of walls."""
@@ -63,20 +62,10 @@ class _Sensor:
         seen = flat(seen, self.instance.inner.observation_space)
         return any(np.array_equal(one, seen, equal_nan=True) for one in self.given)
 
-    def _observe(self, *arguments: Any, **options: Any) -> Any:
+    def _observe(self) -> Any:
         instance = self.instance
-        if self._within:
-            return self._own(*arguments, **options)
-        self._within = True
-        instance.physics.leave()
-        try:
-            instance.physics.write(instance.moved(instance.physics.read(), self.offset))
-            seen = self._own(*arguments, **options)
-        finally:
-            instance.physics.come_back()
-            self._within = False
-        self.given.append(flat(seen, instance.inner.observation_space))
-        return seen
+        self.given.append(instance.seen_as("now", instance.physics.read(), self.offset))
+        return shaped(self.given[-1], instance.inner_seen, instance.inner.observation_space)
 
 
 def check_use(spec: EnvironmentSpec) -> None:
