@@ -14,8 +14,6 @@ import numpy as np
 from hyrl_mj.fields.seen import TINY, Seen, cross, dot, norm, pick
 from hyrl_mj.tasks import CLEAR, LEFT, PROJECTED, RIGHT
 
-# Posts that leave less room between them than this, now or in 2 s, are one obstacle [m].
-ROOM = 0.3
 # A turn about less than this angle has a side of its own [rad].
 TURNED = 2.0
 # Where nothing blocks the way, a post that is this near comes into focus [m].
@@ -64,17 +62,6 @@ class Bend:
     around: np.ndarray
 
 
-def neighbours(posts: np.ndarray) -> np.ndarray:
-    """Returns between which posts (n, K, 5) there is no room now or soon: (n, K, K), 1 or 0."""
-    x, y, vx, vy, radius = (posts[:, :, i] for i in range(5))
-    dx, dy = x[:, :, None] - x[:, None], y[:, :, None] - y[:, None]
-    sx, sy = x + 2.0 * vx, y + 2.0 * vy
-    sx, sy = sx[:, :, None] - sx[:, None], sy[:, :, None] - sy[:, None]
-    reach = radius[:, :, None] + (radius + ROOM)[:, None]
-    least = np.minimum(dx * dx + dy * dy, sx * sx + sy * sy)
-    return (least < reach * reach).astype(float)
-
-
 def tangent(
     x: np.ndarray, y: np.ndarray, radius: np.ndarray, sign: np.ndarray | float
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -121,10 +108,7 @@ def first_bend(seen: Seen, focus: np.ndarray, side: np.ndarray, wider: float) ->
         wider: by how much the disc of the post in focus is wider than others [m].
     """
     reach = seen.radius + CLEAR + wider * seen.only(focus)
-    # Posts without room between them, one after the other, over up to 16 posts.
-    near = neighbours(seen.posts)
-    near = near @ near
-    near = near @ near
+    near = seen.near
     x, y, far = seen.goal_x, seen.goal_y, seen.goal_far
     passed = seen.radius < 0
     best, best_side, kept_side = np.full_like(focus, -1), np.full_like(focus, LEFT), side
@@ -143,6 +127,7 @@ def first_bend(seen: Seen, focus: np.ndarray, side: np.ndarray, wider: float) ->
             break
         post = np.where(blocks, seen.room, np.inf).argmin(axis=1)
         own = seen.only(post)
+        # Up to 16 gaps, one after the other.
         row = own.astype(float)[:, None] @ near @ near @ near @ near
         wall = row[:, 0] > 0
         together = (wall & seen.only(best)).any(axis=1)
