@@ -10,7 +10,7 @@ import pytest
 import hyrl_mj
 from hyrl_mj.export import export_numpy, export_onnx
 from hyrl_mj.fields import Driving, FocusController, decoded, encoded, for_posts
-from hyrl_mj.fields.controller import GuardedPolicy
+from hyrl_mj.fields.controller import GuardedPolicy, TangentLaw
 from hyrl_mj.fields.focus import choose
 from hyrl_mj.fields.guard import Guard
 from hyrl_mj.fields.seen import Seen
@@ -120,6 +120,18 @@ def test_posts_without_room_between_them_are_passed_on_the_same_side():
     assert chosen((-6.0, 1.2, 0.0), wall) == (3, LEFT)
     apart = [(x, 2 * y, r) for x, y, r in wall]
     assert chosen((-6.0, 0.3, 0.0), apart)[0] == 1
+
+
+def test_a_row_of_posts_is_passed_on_the_side_that_was_chosen(field):
+    row = [(-3.0, y, 0.35) for y in np.arange(-2.4, 2.5, 0.8)]
+    for side, y in ((LEFT, 0.85), (RIGHT, -0.85), (LEFT, 0.0), (RIGHT, 0.0)):
+        for focus in range(2, 5):
+            assert chosen((-3.7, y, 1.28), row, focus, side)[1] == side
+    task = drive_of(field, row, time=25.0)
+    controller = FocusController(task, {q: TangentLaw(field, q) for q in (LEFT, RIGHT)}, 0.1)
+    starts = np.array([[-4.5, -1.0, 1.0]])
+    run = closed_loop(task, controller, starts, None, settings=LoopSettings(quiet=True))
+    assert run.outcome.tolist() == [Outcome.REACHED]
 
 
 def test_noise_does_not_change_focus_and_side():
@@ -360,21 +372,23 @@ def test_what_a_controller_begins_with_the_same_measurement_does_not_change(fiel
     assert (at_first_sight // 2 != first // 2).mean() > 0.02
 
 
-@pytest.mark.parametrize("export", [export_numpy, export_onnx])
-def test_the_controller_of_a_run_is_exported_as_that_of_fields(field, tmp_path, export):
+def test_the_controller_of_a_run_is_exported_as_that_of_fields(field, tmp_path):
     acting = {q: GuardedPolicy(field, Weighted(q), q, 0.1) for q in (LEFT, RIGHT)}
     written, sides = tmp_path / "field.json", {q: Everything() for q in acting}
     written.write_text(
         '{"goal_m": [0, 0], "posts": [{"radius_m": 0.5, "positions_m": [[-3, 0]]}, {"radius_m": 0.5, '
         '"positions_m": [[-3, 3]]}], "starts": [{"position_m": [-6, 0], "heading_rad": 0}]}'
     )
-    run = HybridController(field, acting, sides)
-    export(run, tmp_path / "two", written)
-    export(for_posts(field, {0: Weighted(0), 1: Weighted(1)}, 0.1, 2), tmp_path / "same")
-    name = "controller.py" if export is export_numpy else ""
-    assert (tmp_path / "two" / name).read_bytes() == (tmp_path / "same" / name).read_bytes()
-    with pytest.raises(hyrl_mj.BadInput, match=r"has 1 mode.*hyrl-mj run field"):
-        export(HybridController(field, {0: acting[0]}, {0: Everything()}), tmp_path / "one")
+    export_numpy(HybridController(field, acting, sides), tmp_path / "two", written)
+    step = run_path(str(tmp_path / "two" / "controller.py"))["step"]
+    seen = measured((-6, 0.2, 0.5), [(-3, 0, 0.5), (-3, 3, 0.5)])
+    controller = for_posts(field, {q: Weighted(q) for q in acting}, 0.1, 2)
+    for found, right in zip(step([7], seen), controller.step(np.array([7]), seen), strict=True):
+        np.testing.assert_allclose(found, right, atol=1e-9)
+    one_sided = HybridController(field, {0: acting[0]}, {0: Everything()})
+    for export in (export_numpy, export_onnx):
+        with pytest.raises(hyrl_mj.BadInput, match=r"has 1 mode.*hyrl-mj run field"):
+            export(one_sided, tmp_path / "one")
 
 
 def test_a_field_has_from_one_to_a_hundred_posts(field):

@@ -86,6 +86,13 @@ class Seen:
         near = near @ near
         return near @ near
 
+    def wall(self, own: np.ndarray) -> np.ndarray:
+        """Returns the posts that are one obstacle with posts own (n, K) bool: (n, K) bool."""
+        near = self.near
+        # Up to 16 gaps, one after the other.
+        row = own.astype(float)[:, None] @ near @ near @ near @ near
+        return row[:, 0] > 0
+
     def only(self, index: np.ndarray) -> np.ndarray:
         """Returns which of the posts has an index (n,): (n, K) bool."""
         return np.arange(self.radius.shape[1]) == index[:, None]

@@ -106,7 +106,7 @@ def _cautions(field: FieldFile, body: float, speed: float) -> Iterator[str]:
     if one:
         yield (
             f"{_pairs(one)}, less than {ROOM:g} m (the robot is {2 * body:g} m wide): such posts are passed "
-            "around as one obstacle"
+            "around as one obstacle, and a robot may stay in front of a row of many, or of a bent one"
         )
     if narrow:
         yield (
