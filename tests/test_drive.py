@@ -454,6 +454,16 @@ def test_an_attack_is_at_least_as_bad(planted, read, monkeypatch):
     assert clearance[0] < clearance[1] + 0.05
 
 
+def test_what_the_noise_of_the_options_loses_is_lost_to_the_worst_noise(planted, read, monkeypatch):
+    field = read(starts=[start(-5, 0.3)], time_s=6)
+    plain = driven(planted, field).arcs
+    assert [arcs[0].outcome for arcs in plain.values()] == ["crashed", "reached", "reached"]
+    nothing = dict.fromkeys(plain, SimpleNamespace(arcs=plain["hyrl"]))
+    monkeypatch.setattr(drives, "attack", lambda *_, **__: nothing)
+    attacked = driven(planted, field, attack=True).attacked
+    assert [arcs[0].outcome for arcs in attacked.values()] == ["crashed", "reached", "reached"]
+
+
 # ---- fields that nobody would draw: who arrives has come to the goal and touched nothing on its way
 
 DT = 0.05
