@@ -289,8 +289,10 @@ class Parts(FocusController):
     def guard(self) -> Counting:
         return Counting(**vars(super().guard), acting=self.guarded)
 
-    def answer(self, q: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return super().answer(q if self.remembers else np.full_like(q, -1), measured)
+    def answer(
+        self, q: np.ndarray, measured: np.ndarray, looks: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        return super().answer(q if self.remembers else np.full_like(q, -1), measured, looks)
 
 
 def rows_of(run: hyrl_mj.Run, task: Driving, seed: int) -> dict[str, Controller]:

@@ -32,9 +32,11 @@ from hyrl_mj.fields.controller import TangentLaw
 from hyrl_mj.fields.drives import bounds_asked_for, bounds_made_for
 from hyrl_mj.policies import ObservationPolicy
 from hyrl_mj.simulation import AttackSettings
+from hyrl_mj.simulation.rules import Rules
 from hyrl_mj.tasks import LEFT, RIGHT, wrapped
 from hyrl_mj.viz.colours import MODES
 from hyrl_mj.viz.drives import drive_sentences
+from hyrl_mj.viz.replay.panel import Track
 
 BODY = 0.1
 POST = {"radius_m": 0.5, "positions_m": [[-3.0, 0.0]]}
@@ -97,6 +99,11 @@ def test_a_file_says_what_stands_where(read):
     assert read().time == 15, "unless the file says otherwise"
 
 
+def test_a_file_may_begin_with_the_mark_of_its_encoding(written):
+    path = written("\ufeff" + json.dumps(ONE))
+    assert read_field(path).layouts.posts == 1
+
+
 def without(key):
     return {k: v for k, v in ONE.items() if k != key}
 
@@ -146,6 +153,10 @@ BAD = {
     ),
     "interval 0": ({**ONE, "interval_s": 0}, ["interval_s is 0", "> 0"]),
     "time": ({**ONE, "time_s": 1e6}, ["time_s is 1000000.0", "at most 3600 s"]),
+    "memory": (
+        {**ONE, "posts": [POST] * 96, "starts": [START] * 400},
+        ["400 starts", "96 post(s)", "at most 5,000 s of all together"],
+    ),
 }
 
 
@@ -224,7 +235,11 @@ def test_what_can_be_passed_is_none(read):
             {"posts": [{**POST, "positions_m": [[-3, 0], [-3, 1]]}], "interval_s": 2},
             ["post 0 moves at up to 0.5 m/s", "at most 0.4 m/s"],
         ),
-        ({"posts": [post(0.65, 0)]}, ["post 0 ends 0.15 m from the goal", "does not arrive"]),
+        ({"posts": [post(0.65, 0)]}, ["post 0 ends 0.15 m from the goal", "may wait near it"]),
+        (
+            {"starts": [START, start(-16, 0)]},
+            ["start 1 is 16 m from the goal", "1 m/s drives within 15 s", "time_s"],
+        ),
     ],
 )
 def test_what_the_policies_do_not_know_is_said_with_figures(content, parts, read):
@@ -402,6 +417,22 @@ def test_the_bounds_are_those_that_were_asked_for(planted, read):
     assert (off[[2, 5, 6, 7, 8]] > [0.015, 0.04, 0.04, 0.03, 0.03]).all()
 
 
+def test_noise_on_robot_and_posts_adds_up_in_the_way_to_a_post(planted, read):
+    result = driven(planted, read(time_s=0.2), eps_posts=0.05)
+    arc, columns = result.arcs["hyrl"][0], result.task.noisy
+    off = arc.measured[:-1, 5:7] - arc.measured[:-1, :2] - ([-3.0, 0.0] - arc.z[:-1, :2])
+    np.testing.assert_allclose(np.abs(off), 0.15)
+    rules = Rules(result.task, SimpleNamespace(modes=(0,)), 0.1, np.array(columns))
+    together = rules.noise[(rules.noise != 0).sum(axis=1) == 5]
+    np.testing.assert_allclose(np.abs(together[:, 5:7] - together[:, :2]), 0.15)
+
+
+def test_a_run_that_is_over_before_it_began_is_shown_in_no_mode(planted, read):
+    result = driven(planted, read(starts=[start(0, 0)]))
+    track = Track(result.task, result.arcs["hyrl"][0])
+    assert (track.modes, track.tinted(0), len(track.jumps)) == (False, frozenset(), 0)
+
+
 def test_more_noise_than_that_of_the_run_is_said(planted):
     options = DriveOptions(eps=0.2, eps_heading=0.01, eps_posts=0.05)
     texts = noise_cautions(planted.task, 0.1, options)
@@ -421,6 +452,16 @@ def test_an_attack_is_at_least_as_bad(planted, read, monkeypatch):
         least_clearance(result.task, arcs["hyrl"][0]) for arcs in (result.attacked, result.arcs)
     ]
     assert clearance[0] < clearance[1] + 0.05
+
+
+def test_what_the_noise_of_the_options_loses_is_lost_to_the_worst_noise(planted, read, monkeypatch):
+    field = read(starts=[start(-5, 0.3)], time_s=6)
+    plain = driven(planted, field).arcs
+    assert [arcs[0].outcome for arcs in plain.values()] == ["crashed", "reached", "reached"]
+    nothing = dict.fromkeys(plain, SimpleNamespace(arcs=plain["hyrl"]))
+    monkeypatch.setattr(drives, "attack", lambda *_, **__: nothing)
+    attacked = driven(planted, field, attack=True).attacked
+    assert [arcs[0].outcome for arcs in attacked.values()] == ["crashed", "reached", "reached"]
 
 
 # ---- fields that nobody would draw: who arrives has come to the goal and touched nothing on its way
@@ -575,7 +616,7 @@ def test_what_is_wrong_with_the_run_or_the_file_is_one_sentence(command, written
     agent = SimpleNamespace(**{**vars(planted), "policy": Steering(planted.task, LEFT)})
     for run, part in (
         (other, "is a run of vehicle"),
-        (one_sided, "has 1 mode"),
+        (one_sided, "has 1 mode(s)"),
         (agent, "is a run of an agent"),
     ):
         status, _, errors = command("--field", path, run=run)

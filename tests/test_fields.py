@@ -10,10 +10,12 @@ import pytest
 import hyrl_mj
 from hyrl_mj.export import export_numpy, export_onnx
 from hyrl_mj.fields import Driving, FocusController, decoded, encoded, for_posts
+from hyrl_mj.fields.controller import GuardedPolicy, TangentLaw
 from hyrl_mj.fields.focus import choose
 from hyrl_mj.fields.guard import Guard
 from hyrl_mj.fields.seen import Seen
-from hyrl_mj.policies import PolicyController
+from hyrl_mj.policies import HybridController, PolicyController
+from hyrl_mj.sets import Everything
 from hyrl_mj.simulation import LoopSettings, Noise, Recorded, closed_loop
 from hyrl_mj.tasks import LEFT, RIGHT, Layouts, Outcome, length
 from hyrl_mj.tasks.field import CLEAR, turns_to, ways_round
@@ -118,6 +120,18 @@ def test_posts_without_room_between_them_are_passed_on_the_same_side():
     assert chosen((-6.0, 1.2, 0.0), wall) == (3, LEFT)
     apart = [(x, 2 * y, r) for x, y, r in wall]
     assert chosen((-6.0, 0.3, 0.0), apart)[0] == 1
+
+
+def test_a_row_of_posts_is_passed_on_the_side_that_was_chosen(field):
+    row = [(-3.0, y, 0.35) for y in np.arange(-2.4, 2.5, 0.8)]
+    for side, y in ((LEFT, 0.85), (RIGHT, -0.85), (LEFT, 0.0), (RIGHT, 0.0)):
+        for focus in range(2, 5):
+            assert chosen((-3.7, y, 1.28), row, focus, side)[1] == side
+    task = drive_of(field, row, time=25.0)
+    controller = FocusController(task, {q: TangentLaw(field, q) for q in (LEFT, RIGHT)}, 0.1)
+    starts = np.array([[-4.5, -1.0, 1.0]])
+    run = closed_loop(task, controller, starts, None, settings=LoopSettings(quiet=True))
+    assert run.outcome.tolist() == [Outcome.REACHED]
 
 
 def test_noise_does_not_change_focus_and_side():
@@ -338,6 +352,43 @@ def test_a_controller_of_fields_is_exported(field, tmp_path):
     for exported in (module["step"](q, seen), session.run(None, {"q": q, "measured": seen})):
         np.testing.assert_allclose(exported[0], u, atol=1e-5)
         np.testing.assert_array_equal(exported[1], after)
+    first = controller.initial_mode(seen)
+    np.testing.assert_array_equal(module["initial_mode"](seen), first)
+    begun = session.run(None, {"q": np.full(40, -1), "measured": seen})
+    np.testing.assert_array_equal(begun[1], first)
+
+
+def test_what_a_controller_begins_with_the_same_measurement_does_not_change(field):
+    rng, n = np.random.default_rng(0), 400
+    posts = np.column_stack([rng.uniform(-5, 5, (12, 2)), rng.uniform(0.3, 0.9, 12)])
+    seen = np.vstack(
+        [measured((*rng.uniform(-7, 7, 2), rng.uniform(-3, 3)), posts) for _ in range(n)]
+    )
+    seen = seen[Seen(seen).room.min(axis=1) > 0.3]
+    controller = straight(field, posts)
+    first = controller.initial_mode(seen)
+    assert (controller.step(first, seen)[1] // 2 != first // 2).mean() < 0.01
+    at_first_sight = controller.answer(np.full(len(seen), -1), seen)[1]
+    assert (at_first_sight // 2 != first // 2).mean() > 0.02
+
+
+def test_the_controller_of_a_run_is_exported_as_that_of_fields(field, tmp_path):
+    acting = {q: GuardedPolicy(field, Weighted(q), q, 0.1) for q in (LEFT, RIGHT)}
+    written, sides = tmp_path / "field.json", {q: Everything() for q in acting}
+    written.write_text(
+        '{"goal_m": [0, 0], "posts": [{"radius_m": 0.5, "positions_m": [[-3, 0]]}, {"radius_m": 0.5, '
+        '"positions_m": [[-3, 3]]}], "starts": [{"position_m": [-6, 0], "heading_rad": 0}]}'
+    )
+    export_numpy(HybridController(field, acting, sides), tmp_path / "two", written)
+    step = run_path(str(tmp_path / "two" / "controller.py"))["step"]
+    seen = measured((-6, 0.2, 0.5), [(-3, 0, 0.5), (-3, 3, 0.5)])
+    controller = for_posts(field, {q: Weighted(q) for q in acting}, 0.1, 2)
+    for found, right in zip(step([7], seen), controller.step(np.array([7]), seen), strict=True):
+        np.testing.assert_allclose(found, right, atol=1e-9)
+    one_sided = HybridController(field, {0: acting[0]}, {0: Everything()})
+    for export in (export_numpy, export_onnx):
+        with pytest.raises(hyrl_mj.BadInput, match=r"has 1 mode.*hyrl-mj run field"):
+            export(one_sided, tmp_path / "one")
 
 
 def test_a_field_has_from_one_to_a_hundred_posts(field):

@@ -9,7 +9,7 @@ from typing import Any
 
 from hyrl_mj import pipeline
 from hyrl_mj.errors import BadInput, printable, unknown
-from hyrl_mj.fields import DriveOptions, exported_controller
+from hyrl_mj.fields import DriveOptions
 from hyrl_mj.files import trust
 from hyrl_mj.gym_import import EnvironmentOptions, chosen_task, explained
 from hyrl_mj.judging import Word
@@ -444,7 +444,7 @@ def export(run: Run, *, to: str, out: Path, field: Path | None = None, force: bo
     from hyrl_mj.export import FORMS, files_of
 
     with trust.output(*files_of(to, out), force=force):
-        FORMS[to](exported_controller(run.controller, field), out)
+        FORMS[to](run.controller, out, field)
     print(f"controller at {out}")
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from hyrl_mj.errors import BadInput, brief, unknown
 from hyrl_mj.export.source import write_function
-from hyrl_mj.fields import FocusController
+from hyrl_mj.fields import FocusController, exported_controller
 from hyrl_mj.files import artifacts
 from hyrl_mj.policies import ACTIVATIONS, ON_EDGE, HybridController, MlpPolicy
 from hyrl_mj.sets import Cloud, Everything, Grid, GridSet, StateSet
@@ -32,7 +32,9 @@ Exportable = HybridController | FocusController
 Step = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
-def export_numpy(controller: Exportable, folder: str | Path) -> list[Path]:
+def export_numpy(
+    controller: Exportable, folder: str | Path, field: str | Path | None = None
+) -> list[Path]:
     """Writes a controller as controller.py and controller.npz, which need NumPy alone; returns their paths.
 
     The module has `step(q, measured) -> (u, q_next)` and `initial_mode(measured)`, as the controller does.
@@ -40,11 +42,12 @@ def export_numpy(controller: Exportable, folder: str | Path) -> list[Path]:
     Args:
         controller: its policies are networks, and its sets are on grids.
         folder: is created if it does not exist.
+        field: for a run of field, the file of a field with as many posts as will be seen; by default one.
 
     Raises:
         BadInput: the controller cannot be exported, or the files cannot be written.
     """
-    folder = Path(folder)
+    controller, folder = exported_controller(controller, field), Path(folder)
     path = folder / TEMPLATE.name
     first_line = TEMPLATE.read_text(encoding="utf-8").partition("\n")[0]
     if path.exists() and first_line not in path.read_text(encoding="utf-8", errors="replace"):
@@ -59,7 +62,7 @@ def export_numpy(controller: Exportable, folder: str | Path) -> list[Path]:
     return [folder / source.name for source in written]
 
 
-def export_onnx(controller: Exportable, path: str | Path) -> Path:
+def export_onnx(controller: Exportable, path: str | Path, field: str | Path | None = None) -> Path:
     """Writes a controller as one ONNX file, and returns its path: modes, sets and the jump rule in one graph.
 
     Its inputs are q (n,) int64 and measured (n, p) float64, its outputs u (n, m) float64 and q_next (n,)
@@ -69,12 +72,13 @@ def export_onnx(controller: Exportable, path: str | Path) -> Path:
     Args:
         controller: its policies are networks, and its sets are on grids.
         path: the file to write.
+        field: as in `export_numpy`.
 
     Raises:
         BadInput: the controller cannot be exported, the file cannot be written, or the packages onnx and
             onnxruntime are missing.
     """
-    path = Path(path)
+    controller, path = exported_controller(controller, field), Path(path)
     sets: list[StateSet] = []
     if isinstance(controller, HybridController):
         sets = [*controller.flow_sets.values(), *(controller.starts or {}).values()]
@@ -155,7 +159,7 @@ def _traced_step(controller: FocusController, arrays: dict[str, np.ndarray]) -> 
     task, rng = controller.task, np.random.default_rng(0)
     q, measured = rng.choice((*controller.modes, -1), BATCH), _measurements(task, BATCH, rng)
     what = f"the controller of {task.name}"
-    answer = trace(controller.answer, {"q": q, "measured": measured}, what)
+    answer = trace(controller.begin, {"q": q, "measured": measured}, what)
     sentence = "Does `step` without checks; where q is -1, begins in the initial mode."
     finite = """
 
@@ -175,7 +179,7 @@ def _network(controller: HybridController, q: int) -> MlpPolicy:
     if not isinstance(policy, MlpPolicy):
         raise BadInput(
             f"the policy of mode {q} is a {type(policy).__name__}: only networks, MlpPolicy, can be "
-            "exported"
+            "exported; where hyrl_mj is installed, take run.controller"
         )
     if policy.task.name != task:
         raise BadInput(f"the policy of mode {q} is for {policy.task.name}, not {task}")

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -105,6 +104,13 @@ class FocusController:
     eps: float
     first_side: int | None = None
 
+    def __post_init__(self) -> None:
+        if {*self.policies} != {LEFT, RIGHT}:
+            raise BadInput(
+                f"the run has {len(self.policies)} mode(s), but fields take a policy for each side, left and "
+                "right: make one with hyrl-mj run field --out runs/field, perhaps with another --seed"
+            )
+
     @cached_property
     def modes(self) -> tuple[int, ...]:
         """The modes, in ascending order."""
@@ -132,7 +138,7 @@ class FocusController:
             BadInput: a wrong shape, or a measurement that is not finite.
         """
         measured = self.task.check_measurement(measured)
-        return self.answer(np.full(len(measured), -1), measured)[1]
+        return self.begin(np.full(len(measured), -1), measured)[1]
 
     def step(self, q: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns inputs (n, m) and next modes (n,) for modes (n,) and measurements (n, p).
@@ -143,12 +149,24 @@ class FocusController:
         measured = self.task.check_measurement(measured)
         return self.answer(check_modes(q, self.modes), measured)
 
-    def answer(self, q: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def begin(self, q: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Does `answer`, and begins in the initial mode where q is -1: that of a second look.
+
+        A first look may choose what a second one at the same measurement would change.
+        """
+        return self.answer(q, measured, looks=2)
+
+    def answer(
+        self, q: np.ndarray, measured: np.ndarray, looks: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Does `step` without checks and without branches, so that it can be exported.
 
-        The mode -1 stands for none: the answer begins in the initial mode.
+        The mode -1 stands for none: focus and side are then chosen with so many looks.
         """
         seen, (focus, side, sense) = Seen(measured), decoded(q)
+        for _ in range(looks - 1):
+            first = choose(seen, focus, side, self.swing, self.guard.margin)
+            focus, side = np.where(q < 0, first[0], focus), np.where(q < 0, first[1], side)
         focus, side = choose(seen, focus, side, self.swing, self.guard.margin)
         if self.first_side is not None:
             side = np.where(q < 0, self.first_side, side)
@@ -278,23 +296,22 @@ def acting_policy(task: Task, policy: Policy, mode: int, eps: float) -> Policy:
 
 
 def exported_controller(
-    controller: HybridController, field: Path | None = None
+    controller: HybridController | FocusController, field: str | Path | None = None
 ) -> HybridController | FocusController:
-    """Returns the controller to take away: the hybrid controller of a run, or one for fields.
+    """Returns the controller to take away: a controller itself, or of a run of fields the one for fields.
 
     Args:
-        controller: of a run.
+        controller: of a run, or one for fields.
         field: the file of a field with as many posts as the controller will see; by default one post.
 
     Raises:
         BadInput: the file is none of a field, or the task has no use for one.
     """
-    task = controller.task
-    if isinstance(task, Field):
-        sides: dict[int, Any] = {**controller.policies}  # with guards
-        eps = next(iter(sides.values())).eps
+    guarded = {q: pi for q, pi in controller.policies.items() if isinstance(pi, GuardedPolicy)}
+    if guarded:
+        one = next(iter(guarded.values()))
         posts = 1 if field is None else read_field(field).layouts.posts
-        return for_posts(task, {q: side.policy for q, side in sides.items()}, eps, posts)
+        return for_posts(one.task, {q: pi.policy for q, pi in guarded.items()}, one.eps, posts)
     if field is not None:
-        raise BadInput(f"{task.name} has no field of posts: leave --field out")
+        raise BadInput(f"{controller.task.name} has no field of posts: leave --field out")
     return controller

@@ -131,7 +131,13 @@ def drive(
             seed=options.seed,
             settings=attacks,
         )
-        attacked = {name: _checked(task, one.arcs) for name, one in found.items()}
+        # Where nothing that was searched for loses a start, the noise of the options may do so.
+        for name, one in found.items():
+            pairs = zip(_checked(task, one.arcs), arcs[name], strict=True)
+            attacked[name] = [
+                plain if worst.outcome == "reached" != plain.outcome else worst
+                for worst, plain in pairs
+            ]
     return Drives(task, bounds, arcs, attacked)
 
 

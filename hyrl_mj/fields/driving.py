@@ -39,7 +39,8 @@ class Bounds:
 
     def shares(self, posts: int) -> tuple[float, ...]:
         """Returns which share of `largest` acts on each column of a measurement of so many posts."""
-        each = (self.posts, self.posts, self.speeds, self.speeds, 0.0)
+        # Of signs with which what is the same in all columns does not cancel in the ways to posts.
+        each = (-self.posts, -self.posts, self.speeds, self.speeds, 0.0)
         columns = (self.place, self.place, self.heading, 0.0, 0.0, *(each * posts))
         return tuple(bound / (self.largest or 1.0) for bound in columns)
 

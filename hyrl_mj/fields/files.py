@@ -108,11 +108,12 @@ def read_field(path: str | Path) -> FieldFile:
     time = 15.0
     if "time_s" in whole:
         time = whole["time_s"].number(LONGEST, "s", positive=True)
-    most = 100_000.0  # [s]: each sample of each run is kept
+    # [s]: each sample of each run is kept, with what is known of each post. This takes up to 8 GB.
+    most = 500_000.0 / (len(posts) + 4)
     if time * len(starts) > most:
         raise BadInput(
-            f"{path} has {len(starts):,} starts with runs of {time:g} s each: give at most "
-            f"{most:,.0f} s of all together"
+            f"{path} has {len(starts):,} starts with runs of {time:g} s each, and {len(posts)} post(s): give "
+            f"at most {most:,.0f} s of all together"
         )
     places = np.array([start["position_m"].point() for start in starts])
     return FieldFile(str(path), layouts, np.column_stack([places, wrapped(headings)]), time)
@@ -132,7 +133,8 @@ def _content(path: Path) -> Any:
     fewer = f"give a JSON file of a field, with at most {MOST_POSTS} posts"
     content = artifacts.read_given(path, needed, smaller=fewer)
     try:
-        return json.loads(content.decode(), object_pairs_hook=once)
+        # Some editors begin a file with a mark of its encoding.
+        return json.loads(content.decode("utf-8-sig"), object_pairs_hook=once)
     except BadInput:
         raise
     except (ValueError, RecursionError) as error:

@@ -14,8 +14,6 @@ import numpy as np
 from hyrl_mj.fields.seen import TINY, Seen, cross, dot, norm, pick
 from hyrl_mj.tasks import CLEAR, LEFT, PROJECTED, RIGHT
 
-# Posts that leave less room between them than this, now or in 2 s, are one obstacle [m].
-ROOM = 0.3
 # A turn about less than this angle has a side of its own [rad].
 TURNED = 2.0
 # Where nothing blocks the way, a post that is this near comes into focus [m].
@@ -64,17 +62,6 @@ class Bend:
     around: np.ndarray
 
 
-def neighbours(posts: np.ndarray) -> np.ndarray:
-    """Returns between which posts (n, K, 5) there is no room now or soon: (n, K, K), 1 or 0."""
-    x, y, vx, vy, radius = (posts[:, :, i] for i in range(5))
-    dx, dy = x[:, :, None] - x[:, None], y[:, :, None] - y[:, None]
-    sx, sy = x + 2.0 * vx, y + 2.0 * vy
-    sx, sy = sx[:, :, None] - sx[:, None], sy[:, :, None] - sy[:, None]
-    reach = radius[:, :, None] + (radius + ROOM)[:, None]
-    least = np.minimum(dx * dx + dy * dy, sx * sx + sy * sy)
-    return (least < reach * reach).astype(float)
-
-
 def tangent(
     x: np.ndarray, y: np.ndarray, radius: np.ndarray, sign: np.ndarray | float
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -89,26 +76,22 @@ def tangent(
 
 
 def longer_on_the_left(
-    seen: Seen, reach: np.ndarray, own: np.ndarray, wall: np.ndarray, x: np.ndarray, y: np.ndarray
+    seen: Seen, reach: np.ndarray, wall: np.ndarray, x: np.ndarray, y: np.ndarray
 ) -> np.ndarray:
     """Returns by how much (n,) ways to x, y (n,) are longer on the left of posts than on the right [m].
 
     Args:
         seen: what was measured.
         reach: (n, K) radii of the discs to pass [m].
-        own: (n, K) bool, the post.
-        wall: (n, K) bool, the posts that are one obstacle with it, and are passed on the same side.
+        wall: (n, K) bool, the posts that are one obstacle, and are passed on the same side.
         x, y: the target [m].
     """
-    post_x, post_y = pick(seen.x, own)[:, None], pick(seen.y, own)[:, None]
-    off = np.arctan2(cross(post_x, post_y, seen.x, seen.y), dot(post_x, post_y, seen.x, seen.y))
-    half = np.arcsin(np.minimum(reach / seen.far, 1.0))
     lengths = []
     for sign in (1.0, -1.0):
         leg_x, leg_y = tangent(seen.x, seen.y, reach, sign)
         whole = norm(leg_x, leg_y) + norm(x[:, None] - leg_x, y[:, None] - leg_y)
-        last = np.where(wall, sign * off + half, -np.inf).argmax(axis=1)
-        lengths.append(pick(whole, seen.only(last)))
+        # Who passes all of them goes at least as far as past any of them alone.
+        lengths.append(np.where(wall, whole, 0.0).max(axis=1))
     return lengths[0] - lengths[1]
 
 
@@ -121,10 +104,6 @@ def first_bend(seen: Seen, focus: np.ndarray, side: np.ndarray, wider: float) ->
         wider: by how much the disc of the post in focus is wider than others [m].
     """
     reach = seen.radius + CLEAR + wider * seen.only(focus)
-    # Posts without room between them, one after the other, over up to 16 posts.
-    near = neighbours(seen.posts)
-    near = near @ near
-    near = near @ near
     x, y, far = seen.goal_x, seen.goal_y, seen.goal_far
     passed = seen.radius < 0
     best, best_side, kept_side = np.full_like(focus, -1), np.full_like(focus, LEFT), side
@@ -143,14 +122,14 @@ def first_bend(seen: Seen, focus: np.ndarray, side: np.ndarray, wider: float) ->
             break
         post = np.where(blocks, seen.room, np.inf).argmin(axis=1)
         own = seen.only(post)
-        row = own.astype(float)[:, None] @ near @ near @ near @ near
-        wall = row[:, 0] > 0
+        wall = seen.wall(own)
         together = (wall & seen.only(best)).any(axis=1)
-        longer = longer_on_the_left(seen, reach, own, wall, x, y)
+        longer = longer_on_the_left(seen, reach, wall, x, y)
         way = np.where(together, best_side, np.where(longer <= 0, LEFT, RIGHT))
-        # The post in focus is passed on the other side only if that saves much.
+        # The obstacle in focus is passed on the other side only if that saves much.
         held = longer < np.where(side == LEFT, LONGER, -LONGER)
-        way = np.where(post == focus, np.where(held, LEFT, RIGHT), way)
+        known = (wall & seen.only(focus)).any(axis=1)
+        way = np.where(known, np.where(held, LEFT, RIGHT), way)
         if bend == 0:
             # The policies drive straight to the goal where only the wider disc is in the way.
             straight = pick(nearest, own) >= (pick(reach, own) - wider) ** 2
@@ -230,7 +209,8 @@ def choose(
     matters = ((bend.around | (close_by < 0)) & own).any(axis=1)
     urgent = (close_by.min(axis=1) < 0) & (close != best)
     close_side = on_side(seen, seen.only(close), bend.x, bend.y)
-    close_side = np.where(close == focus, side, close_side)
+    known = (seen.wall(seen.only(close)) & own).any(axis=1)
+    close_side = np.where(known, side, close_side)
     best, best_side = np.where(urgent, close, best), np.where(urgent, close_side, best_side)
     first = seen.only(best)
     room_of_best = pick(room, first)

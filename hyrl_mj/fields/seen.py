@@ -5,12 +5,16 @@ Vectors are two arrays, (n,) for n robots or (n, K) for K posts.
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 
 from hyrl_mj.tasks import posts_of
 
 # Distances that are divided by are at least this [m].
 TINY = 1e-9
+# Posts that leave less room between them than this, now or in 2 s, are one obstacle [m].
+ROOM = 0.3
 
 
 def dot(ax: np.ndarray, ay: np.ndarray, bx: np.ndarray, by: np.ndarray) -> np.ndarray:
@@ -33,6 +37,17 @@ def pick(values: np.ndarray, own: np.ndarray) -> np.ndarray:
     return (values * own).sum(axis=1)
 
 
+def neighbours(posts: np.ndarray) -> np.ndarray:
+    """Returns between which posts (n, K, 5) there is no room now or soon: (n, K, K), 1 or 0."""
+    x, y, vx, vy, radius = (posts[:, :, i] for i in range(5))
+    dx, dy = x[:, :, None] - x[:, None], y[:, :, None] - y[:, None]
+    sx, sy = x + 2.0 * vx, y + 2.0 * vy
+    sx, sy = sx[:, :, None] - sx[:, None], sy[:, :, None] - sy[:, None]
+    reach = radius[:, :, None] + (radius + ROOM)[:, None]
+    least = np.minimum(dx * dx + dy * dy, sx * sx + sy * sy)
+    return (least < reach * reach).astype(float)
+
+
 class Seen:
     """What n measurements of K posts say.
 
@@ -41,6 +56,7 @@ class Seen:
 
     Attributes:
         posts: (n, K, 5) as `posts_of` returns them.
+        near: (n, K, K) more than 0 for posts that up to four gaps without room link.
         heading, cos, sin: (n,) heading [rad], its cosine and its sine.
         goal_x, goal_y, goal_far: (n,) way to the goal, and its length, more than 0 [m].
         x, y, far: (n, K) ways to the posts' middles, and their lengths, more than 0 [m].
@@ -63,6 +79,19 @@ class Seen:
         self.room = self.far - self.radius
         self.coming = -dot(self.x, self.y, self.vx, self.vy) / self.far
         self.towards = dot(self.x, self.y, self.cos[:, None], self.sin[:, None]) / self.far
+
+    @cached_property
+    def near(self) -> np.ndarray:
+        near = neighbours(self.posts)
+        near = near @ near
+        return near @ near
+
+    def wall(self, own: np.ndarray) -> np.ndarray:
+        """Returns the posts that are one obstacle with posts own (n, K) bool: (n, K) bool."""
+        near = self.near
+        # Up to 16 gaps, one after the other.
+        row = own.astype(float)[:, None] @ near @ near @ near @ near
+        return row[:, 0] > 0
 
     def only(self, index: np.ndarray) -> np.ndarray:
         """Returns which of the posts has an index (n,): (n, K) bool."""

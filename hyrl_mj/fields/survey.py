@@ -8,7 +8,7 @@ import numpy as np
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.fields.files import FieldFile
-from hyrl_mj.fields.focus import ROOM
+from hyrl_mj.fields.seen import ROOM
 from hyrl_mj.tasks import FASTEST, RADII, TAKEN, length
 
 # How many posts, or gaps, a sentence names.
@@ -82,15 +82,15 @@ def _check_ways(field: FieldFile, body: float) -> None:
             )
 
 
-def cautions(field: FieldFile, body: float) -> list[str]:
+def cautions(field: FieldFile, body: float, speed: float = 1.0) -> list[str]:
     """Returns a sentence about each thing in a field that the policies were not made for.
 
-    `body` is the radius of the robot [m].
+    `body` is the radius of the robot [m], `speed` its greatest speed [m/s].
     """
-    return [f"{field.name}: {text}" for text in _cautions(field, body)]
+    return [f"{field.name}: {text}" for text in _cautions(field, body, speed)]
 
 
-def _cautions(field: FieldFile, body: float) -> Iterator[str]:
+def _cautions(field: FieldFile, body: float, speed: float) -> Iterator[str]:
     layouts, standing = field.layouts, field.standing
     radii, places = layouts.radii[0], layouts.tracks[0, 0]
     gaps = length(places[:, None] - places) - radii[:, None] - radii
@@ -106,7 +106,7 @@ def _cautions(field: FieldFile, body: float) -> Iterator[str]:
     if one:
         yield (
             f"{_pairs(one)}, less than {ROOM:g} m (the robot is {2 * body:g} m wide): such posts are passed "
-            "around as one obstacle"
+            "around as one obstacle, and a robot may stay in front of a row of many, or of a bent one"
         )
     if narrow:
         yield (
@@ -127,12 +127,19 @@ def _cautions(field: FieldFile, body: float) -> Iterator[str]:
             f"{_listed(fast, 'post moves', 'posts move')} at up to {_range(speeds[fast], 'm/s')}: the "
             f"policies were trained with at most {FASTEST:g} m/s"
         )
+    ways = length(field.starts[:, :2] - layouts.goals[0])
+    late = np.flatnonzero(ways > speed * field.time)
+    if len(late):
+        yield (
+            f"{_listed(late, 'start is', 'starts are')} {_range(ways[late], 'm')} from the goal, farther "
+            f"than a robot of {speed:g} m/s drives within {field.time:g} s: give a longer time_s"
+        )
     away = length(layouts.tracks[0, -1] - layouts.goals[0]) - radii
     close = np.flatnonzero(away < TAKEN)
     if len(close):
         yield (
             f"{_listed(close, 'post ends', 'posts end')} {_range(away[close], 'm')} from the goal: where "
-            f"less than {TAKEN:g} m are left, a robot waits near it and does not arrive"
+            f"less than {TAKEN:g} m are left, a robot may wait near it and not arrive"
         )
 
 

@@ -190,7 +190,7 @@ class Rules:
         together = [(1.0, *rest) for rest in product(*signs)] if len(noisy) > 1 else []
         for factors in (*together, *np.eye(len(noisy))):
             noise = np.zeros(len(self.shares))
-            noise[noisy] = np.array(factors) * self.bound * np.abs(self.shares[noisy])
+            noise[noisy] = np.array(factors) * self.bound * self.shares[noisy]
             yield noise
 
 

@@ -22,7 +22,7 @@ from hyrl_mj.fields import (
 from hyrl_mj.policies import MlpPolicy
 from hyrl_mj.runs.directory import Run
 from hyrl_mj.simulation import HybridArc
-from hyrl_mj.tasks import LEFT, RIGHT, Field
+from hyrl_mj.tasks import Field
 from hyrl_mj.viz.options import USUAL, ReplayOptions
 from hyrl_mj.viz.replay import Show, check_replay, render_replay
 from hyrl_mj.viz.tables import NAMES, Table, print_table
@@ -108,7 +108,9 @@ def drive_run(
                 f"{len(field.starts) - 1}"
             )
     made_for = run.settings.eps
-    for caution in (*cautions(field, local.body), *noise_cautions(local, made_for, options)):
+    speed = float(local.input_limits[1][0])
+    unknown = (*cautions(field, local.body, speed), *noise_cautions(local, made_for, options))
+    for caution in unknown:
         logging.getLogger("hyrl_mj").warning("warning: %s", printable(caution))
     drives = drive(local, policy, policies, made_for, field, options, run.settings.attack)
     what, seed = counted(drives.task.layouts.posts, "post"), options.seed
@@ -135,7 +137,7 @@ def _parts(run: Run) -> tuple[Field, MlpPolicy, Mapping[int, MlpPolicy]]:
     """Returns what a run trained: its task, the policy of stage 1, and that of each side.
 
     Raises:
-        BadInput: it is not a run of `field`, or lacks a side.
+        BadInput: it is not a run of `field`.
     """
     remedy = "make one with hyrl-mj run field --out runs/field"
     local = run.task
@@ -147,10 +149,5 @@ def _parts(run: Run) -> tuple[Field, MlpPolicy, Mapping[int, MlpPolicy]]:
     if not isinstance(policy, MlpPolicy):
         raise BadInput(
             f"{run.path} is a run of an agent, but drive takes a run that trained: {remedy}"
-        )
-    if {*policies} != {LEFT, RIGHT}:
-        raise BadInput(
-            f"{run.path} has {len(policies)} mode(s), but drive takes a policy for each side, left and "
-            f"right: {remedy}, perhaps with another --seed"
         )
     return local, policy, policies

@@ -13,7 +13,7 @@ import numpy as np
 from hyrl_mj.errors import BadArtifact
 from hyrl_mj.physics import mjcf
 from hyrl_mj.physics.rendering import GEOMS, HIDDEN, Box, Canvas, SceneRenderer
-from hyrl_mj.simulation import HybridArc
+from hyrl_mj.simulation import NOT_STARTED, HybridArc
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz.colours import BAD, INK, POLICY, WHITE, mode_colour, rgba
 from hyrl_mj.viz.replay import marks
@@ -35,7 +35,8 @@ class Track:
 
     def __init__(self, task: Task, arc: HybridArc, modes: Sequence[int] = (0, 1)):
         self.task, self.arc, self.end = task, arc, float(arc.t[-1])
-        self.modes = arc.controller != "policy"
+        # A run that was over before it began has picked no mode.
+        self.modes = arc.controller != "policy" and arc.q[-1] != NOT_STARTED
         self._of = modes
         if arc.task != task.name:
             raise BadArtifact(
@@ -66,9 +67,8 @@ class Track:
     def jumps(self) -> np.ndarray:
         """Rows right after a jump to a mode of another name; other jumps are not shown."""
         rows = np.flatnonzero(np.diff(self.arc.j) > 0) + 1
-        names = {q: self.task.mode_name(q) for q in map(int, np.unique(self.arc.q))}
-        kept = [names[int(self.arc.q[row - 1])] != names[int(self.arc.q[row])] for row in rows]
-        return rows[np.array(kept, dtype=bool)]
+        names = [[self.task.mode_name(int(self.arc.q[k])) for k in (row - 1, row)] for row in rows]
+        return rows[np.array([before != after for before, after in names], dtype=bool)]
 
     def colour(self, row: int) -> str:
         """Returns the colour of the path from a row on."""
