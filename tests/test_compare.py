@@ -470,9 +470,10 @@ def test_settings_that_no_comparison_holds_are_none(labels, planted_circle, monk
     row = comparing.judged(planted_circle[0], "many", seed=0)
     assert (row.state, row.why_not) == ("unfit", None)
     assert "let it yield fewer, each with a short label of its own" in row.sentence
-    monkeypatch.setattr(sys.modules[__name__], "__file__", None)  # as in a notebook
     task = planted_circle[0].task
-    assert comparing._code(task, "many") != comparing._code(task, "many")
+    for file in (None, "<stdin>"):  # of a notebook, and where code is piped into Python
+        monkeypatch.setattr(sys.modules[__name__], "__file__", file)
+        assert comparing._code(task, "many") != comparing._code(task, "many")
 
 
 def test_what_did_not_fit_is_tried_again(result, folder, small, monkeypatch):

@@ -156,8 +156,9 @@ def _code(task: Task, name: str) -> str:
     if name not in registered():
         return common
     file = getattr(sys.modules.get(type(registered()[name]).__module__), "__file__", None)
-    # What a notebook defines may be another each time.
-    return common + (digest_of(Path(file)) if file else uuid4().hex)
+    # What a notebook defines, or a script that is piped into Python, may be another each time.
+    in_file = file is not None and Path(file).is_file()
+    return common + (digest_of(Path(file)) if in_file else uuid4().hex)
 
 
 def _told(row: Row) -> str:
