@@ -155,10 +155,10 @@ def _code(task: Task, name: str) -> str:
     common = sha256(f"{version('hyrl-mj')} {task.code}".encode()).hexdigest()
     if name not in registered():
         return common
-    file = getattr(sys.modules.get(type(registered()[name]).__module__), "__file__", None)
+    module = sys.modules.get(type(registered()[name]).__module__)
+    file = Path(getattr(module, "__file__", None) or "")
     # What a notebook defines, or a script that is piped into Python, may be another each time.
-    in_file = file is not None and Path(file).is_file()
-    return common + (digest_of(Path(file)) if in_file else uuid4().hex)
+    return common + (digest_of(file) if file.is_file() else uuid4().hex)
 
 
 def _told(row: Row) -> str:
