@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from command_line import call
-from planted import FEW_CELLS, few_replays, without_videos
+from planted import FEW_CELLS, few_replays, played_before, without_videos
 
 import hyrl_mj
 from hyrl_mj import BadInput
@@ -24,7 +24,7 @@ from hyrl_mj.alternatives.smooth import PairedBuffer, SmoothPolicy
 from hyrl_mj.alternatives.timer import TimerSupervisor, returns
 from hyrl_mj.alternatives.training import environment, learned
 from hyrl_mj.files import artifacts
-from hyrl_mj.judging import examination
+from hyrl_mj.judging import ModeResult, examination
 from hyrl_mj.judging.game import ReplayCount
 from hyrl_mj.learning.training import export
 from hyrl_mj.pipeline import comparing, steps, sweeping
@@ -32,6 +32,7 @@ from hyrl_mj.policies import PolicyController, from_callable
 from hyrl_mj.runs.compared import Compared, Row
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import LoopSettings, closed_loop
+from hyrl_mj.stages import retraining
 from hyrl_mj.tasks import Outcome
 from hyrl_mj.viz.compared_page import write_page
 from hyrl_mj.viz.compared_tables import print_compared, ranked, result_table, sentences, tried_table
@@ -304,6 +305,30 @@ def test_an_alternative_gets_the_samples_of_the_whole_run(planted_circle):
     assert given.training().algorithm == s.stage1.algorithm
 
 
+def test_an_alternative_is_paid_as_stage_1_was_and_takes_no_more_samples(
+    planted_circle, monkeypatch
+):
+    run = planted_circle[0].anew()
+    vars(run)["arrivals"] = replace(planted_circle[0].arrivals, trainings=2, shaped=True)
+    given = Given(run, 0)
+    (policy,) = registered()["policy"].candidates(given)
+    assert policy.samples == given.first == 2 * run.settings.stage1.samples
+    assert given.training().shaped
+    assert given.training("ppo").shaped
+    assert environment(given).core.domain.pay is not None
+    asked = []
+
+    def retrained(ground, settings, seed, warm_start):
+        asked.append((ground.shaped, settings.samples * settings.attempts <= given.samples))
+        return run.policy, ModeResult(0, 1.0, 1)
+
+    monkeypatch.setattr(retraining, "retrain", retrained)
+    monkeypatch.setitem(vars(run), "settings", replace(run.settings, stage6=replace(
+        run.settings.stage6, attempts=50)))  # fmt: skip
+    assert len([*registered()["retraining"].candidates(given)]) == 1
+    assert asked == [(True, True)]
+
+
 def test_hysteresis_alone_goes_on_beyond_the_decision_of_the_policy(given):
     (candidate,) = registered()["hysteresis"].candidates(given)
     ahead, beyond = np.array([[np.pi - 0.5]]), np.array([[np.pi + 0.05]])
@@ -355,6 +380,7 @@ def result(folder, small):
 
 def test_rows_are_made_tuned_and_judged_alike(result, folder, planted_circle):
     found, said = result
+    assert len({row.figures["attacked"] for row in found.rows}) == 1
     assert [row.name for row in found.rows] == ["policy", "hyrl", "held"]
     assert all(row.state == "done" for row in found.rows)
     rows = {row.name: row for row in found.rows}
@@ -394,7 +420,8 @@ def test_rows_of_other_code_are_made_again(result, circle):
         *(name for name in found.names if name != "held"),
         "not imported here",
     )
-    assert said == ["held: left out, because their code or that of the task has changed"]
+    (sentence,) = said
+    assert sentence.startswith("held: left out, because their code or that of the task has changed")
     task = copy(circle)
     vars(task)["code"] = "another"
     assert comparing._without_outdated(changed, task, len).rows == ()
@@ -430,6 +457,25 @@ def test_an_alternative_that_makes_a_mistake_is_unfit(mistake, says, planted_cir
     assert says in row.sentence
 
 
+@pytest.mark.parametrize("labels", [range(21), "aa"])
+def test_settings_that_no_comparison_holds_are_none(labels, planted_circle, monkeypatch):
+    class Many(Alternative):
+        name, title = "many", "Many " * 50
+
+        def candidates(self, given):
+            for label in labels:
+                yield Candidate(f"{label}", given.run.controllers["policy"])
+
+    monkeypatch.setattr(base, "_KNOWN", {**base._KNOWN, "many": Many()})
+    row = comparing.judged(planted_circle[0], "many", seed=0)
+    assert (row.state, row.why_not) == ("unfit", None)
+    assert "let it yield fewer, each with a short label of its own" in row.sentence
+    task = planted_circle[0].task
+    for file in (None, "<stdin>"):  # of a notebook, and where code is piped into Python
+        monkeypatch.setattr(sys.modules[__name__], "__file__", file)
+        assert comparing._code(task, "many") != comparing._code(task, "many")
+
+
 def test_what_did_not_fit_is_tried_again(result, folder, small, monkeypatch):
     never(monkeypatch, Unfit("nothing fits it"))
     said = []
@@ -458,6 +504,19 @@ def test_an_alternative_cannot_change_the_run_of_the_others(planted_circle, monk
     monkeypatch.setattr(base, "_KNOWN", {**base._KNOWN, "writes": Writes()})
     assert comparing.judged(run, "writes", seed=0).sentence == "done"
     np.testing.assert_array_equal(run.policy.layers[0][0], before)
+
+
+def test_no_controller_is_attacked_from_starts_of_its_own(planted_circle, small, monkeypatch):
+    """Which are winnable is known only where the game is played, and by HyRL's split."""
+    run = planted_circle[0]
+    played_before(monkeypatch, run)
+
+    def begun(task, regions, *_):
+        raise BadInput(f"winnable: {regions.winnable}")
+
+    monkeypatch.setattr(examination, "attack_starts", begun)
+    with pytest.raises(BadInput, match="winnable: None"):
+        comparing.figures_of(run, run.controllers["hyrl"], 0)
 
 
 @pytest.mark.parametrize("lost", [0, 3])
@@ -608,4 +667,28 @@ def test_of_alternatives_without_a_seed_in_common_nothing_is_said(three):
 
 def test_without_three_seeds_there_is_no_interval(three):
     few = replace(three, rows=tuple(r for r in three.rows if r.seed < 2))
-    assert few.difference("stack", "worst").interval is None
+    assert few.difference("stack").interval is None
+
+
+def test_seeds_that_an_alternative_lacks_are_told(three):
+    """What is said of two is of the seeds that both have."""
+    one = [row for row in three.rows if row.name != "stack" or row.seed == 0]
+    refuted = row("policy", 1, 0.5, won=1.0)
+    found = replace(three, rows=tuple(one)).with_row(refuted)
+    sentence = next(sentences(found))
+    assert "wins from 95.00% of the starts under attack; HyRL wins from 90.00%, 5.00" in sentence
+    assert sentence.endswith("in 1 of 3 seeds.")
+    cells = {row[0]: row for row in result_table(found).rows}
+    assert "Stack, 1 of 3 seeds" in cells
+    assert "all tried, none in 2 of 3 seeds" in cells["Policy"]
+
+
+def test_a_tie_is_one_and_starts_that_were_tried_have_an_error():
+    rows = [row(name, s, 0.9, attacked=100.0) for name in ("hyrl", "stack") for s in range(3)]
+    found = Compared("vehicle", 0.1, "fast", {}, True, tuple(rows))
+    assert ranked(found) == ["stack", "hyrl"]
+    (sentence,) = sentences(found)
+    assert "as many (95% interval -" in sentence
+    low, high = found.difference("stack").interval
+    off = 1.96 * (2 * 0.9 * 0.1 / 300) ** 0.5
+    assert (low, high) == pytest.approx((-off, off), abs=0.01)

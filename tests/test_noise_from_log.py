@@ -424,6 +424,18 @@ def test_a_log_is_of_columns_that_are_those_of_the_chart(tmp_path, monkeypatch):
         noise.against(task, None)
 
 
+def test_what_a_log_tells_of_others_is_no_noise_of_a_robot(tmp_path):
+    log, other = planted(0, 0.05, uniform=0.05), planted(1, 0.05, uniform=9.0)["x"]
+    log |= {"battery": other, "battery_ref": log["x_ref"], "elbow": other}
+    log |= {"shoulder": log["x"], "shoulder_ref": log["x_ref"]}
+    path = write(tmp_path / "log.csv", log)
+    noise = noise_of(get_task("arm"), f"log {path}", 0.0)
+    assert noise.bound == pytest.approx(0.05, rel=0.1)
+    assert noise.kind == f"log {path}", "another log of this name is another noise"
+    exact = {"t": log["t"], "x": log["x_ref"], "x_ref": log["x_ref"]}
+    assert "--noise" not in call("noise", write(tmp_path / "exact.csv", exact)).stdout
+
+
 def write_theta(folder, log):
     """Writes a log of theta."""
     return write(folder / "log.csv", {k.replace("x", "theta"): v for k, v in log.items()})

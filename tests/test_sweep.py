@@ -19,14 +19,14 @@ import pytest
 from attacks.crafted_runs import MARKER
 from attacks.doors import plant_modules
 from command_line import call
-from planted import TINY, coarsen, decisions, few_replays, halves, shorten
+from planted import FEW_CELLS, TINY, coarsen, decisions, few_replays, halves, shorten
 from test_report import plant
 
 import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, pipeline
 from hyrl_mj.files import artifacts
 from hyrl_mj.judging import Regions, episodes, noisy_episodes
-from hyrl_mj.judging.game import Comparison, EpisodeCount
+from hyrl_mj.judging.game import Comparison, Curve, EpisodeCount, WinningShares
 from hyrl_mj.learning import changed, preset
 from hyrl_mj.physics import mjcf
 from hyrl_mj.pipeline import cluster, report
@@ -37,6 +37,7 @@ from hyrl_mj.runs.directory import Run, write_config
 from hyrl_mj.runs.sweeps import Common, Row, Setting, Sweep
 from hyrl_mj.system import cores, progress
 from hyrl_mj.viz import commands, sweep_tables, tables
+from hyrl_mj.viz.sweep_page import draw_curves
 
 CIRCLE = Setting("unit_circle", "", 0.1)
 SMOKE = {"preset": "smoke", "set": TINY}
@@ -190,15 +191,58 @@ def test_a_stranger_s_sweep_leads_nowhere_else(tmp_path):
         report(tmp_path)
 
 
+PLANTED = Common("smoke", None, FEW_CELLS)
+
+
 @pytest.mark.parametrize(
-    "other", [(Setting("unit_circle", "", 0.2), 0), (Setting("unit_circle", "", 0.1), 1)]
+    ("row", "common", "differs"),
+    [
+        (Row(CIRCLE, 0), PLANTED, ""),
+        (Row(replace(CIRCLE, eps=0.2), 0), PLANTED, "eps: 0.1 there, 0.2 given"),
+        (Row(CIRCLE, 1), PLANTED, "seed: 0 there, 1 given"),
+        (Row(CIRCLE, 0), replace(PLANTED, horizon=0.4), "horizon: None there, 0.4 given"),
+        (Row(CIRCLE, 0), replace(PLANTED, set={}), "lattice: 130 there"),
+        (Row(replace(CIRCLE, task="vehicle"), 0), PLANTED, "holds a run of unit_circle with other"),
+        (Row(replace(CIRCLE, algorithm="a:B"), 0), PLANTED, "policy: training with ppo"),
+    ],
 )
-def test_a_run_of_another_row_is_not_shown(other, planted_circle, tmp_path):
-    row, moved = Row(Setting("unit_circle", "", 0.1), 0), Row(*other)
-    for one in (row, moved):
-        shutil.copytree(planted_circle[0].path, tmp_path / one.name)
-    assert row.on_disk(tmp_path).done
-    assert "holds a run of unit_circle, " in moved.on_disk(tmp_path).sentence
+def test_a_run_of_other_settings_is_not_shown(row, common, differs, planted_circle, tmp_path):
+    shutil.copytree(planted_circle[0].path, tmp_path / row.name)
+    found = row.on_disk(tmp_path, common)
+    assert found.done == (not differs)
+    assert differs in found.sentence
+
+
+def test_a_run_whose_folder_is_gone_is_not_shown(tmp_path):
+    done = Row(CIRCLE, 0, "done", "s", "WON", 1.0, {"hyrl_proved": 1.0})
+    Sweep(PLANTED, (done,)).save(tmp_path)
+    assert [row.state for row in report(tmp_path).rows] == ["open"]
+    assert "unit_circle-0.1-0: open" in (tmp_path / "sweep.html").read_text()
+
+
+def test_of_what_a_replay_refutes_nothing_is_told(planted_circle):
+    """As in a comparison."""
+    result = planted_circle[0].robustness
+    assert result.game.replays_of("policy").failures
+    found = sweeps._figures(result)
+    assert found["policy_not_broken"] is found["policy_proved"] is None
+    assert found["policy_won"] == result.game.scores["policy"][-1].won
+    assert found["policy_not_broken_without_noise"] is not None
+
+
+@pytest.mark.parametrize("bounded", [(True, True), (False, False), (True, False)])
+def test_curves_of_controllers_of_which_nothing_is_proved(bounded):
+    shares, drawn = (1.0, 0.5), []
+    for one in bounded:
+        known, none = (
+            WinningShares(*4 * [shares], shares),
+            WinningShares(shares, shares, (), (), shares),
+        )
+        wins = {"policy": none, "hyrl": known if one else none}
+        drawn.append(Curve((0.0, 0.1), shares, wins))
+    (panel,) = draw_curves({CIRCLE: drawn}).axes
+    labels = {line.get_label() for line in panel.lines}
+    assert (f"HyRL {'proved' if all(bounded) else 'won'}, own q0") in labels
 
 
 def test_shares_of_episodes_are_of_all_start_regions():
@@ -461,7 +505,7 @@ def test_a_cluster_of_two_machines_makes_runs_on_both_and_goes_on_after_one_that
 def test_a_machine_that_keeps_its_files_is_told_of(tmp_path):
     from hyrl_mj.pipeline.sweeping import _seen
 
-    kept = _seen(row(0), tmp_path)
+    kept = _seen(row(0), tmp_path, PLANTED)
     assert kept.state == "stopped"
     assert "share" in kept.sentence
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from hyrl_mj.alternatives.base import Alternative, Candidate, Given, Unfit, register
-from hyrl_mj.learning import Training
 from hyrl_mj.policies import HybridController
 from hyrl_mj.sets import GridSet
 from hyrl_mj.stages import ExtendedSets, HeldInputs, Partition, part_policies, table_for
@@ -21,9 +22,7 @@ class StageOne(Alternative):
     title = "RL policy"
 
     def candidates(self, given: Given) -> Iterator[Candidate]:
-        settings = given.run.settings.stage1
-        samples = settings.samples if isinstance(settings, Training) else 0
-        yield Candidate("as trained", given.run.controllers["policy"], samples)
+        yield Candidate("as trained", given.run.controllers["policy"], given.first)
 
 
 @register
@@ -76,16 +75,20 @@ class RetrainingAlone(Alternative):
 
     def candidates(self, given: Given) -> Iterator[Candidate]:
         from hyrl_mj.stages.grounds import mode_ground
-        from hyrl_mj.stages.retraining import retrain
+        from hyrl_mj.stages.retraining import retrain, start_policy
 
-        task, s = given.task, given.run.settings
+        task, s, steady = given.task, given.run.settings, given.run.steady
         if task.for_mode(0) is not task:
             raise Unfit("the task has a reward for each mode, and one policy has no mode")
         sets, parts = one_mode(given)
-        ground = mode_ground(task, sets, 0, parts, given.run.steady, False, s.modes, s.attack)
-        policy, result = retrain(ground, s.stage6, given.seed)
-        samples = result.attempts * s.stage6.samples
-        yield Candidate("all of the chart", policy, samples)
+        shaped = given.run.arrivals.shaped
+        ground = mode_ground(task, sets, 0, parts, steady, False, s.modes, s.attack, shaped)
+        each = min(s.stage6.samples, given.samples)
+        most = min(s.stage6.attempts, given.samples // each)
+        settings = replace(s.stage6, samples=each, attempts=most)
+        warm = partial(start_policy, steady, parts)
+        policy, result = retrain(ground, settings, given.seed, warm_start=warm)
+        yield Candidate("all of the chart", policy, result.attempts * each)
 
 
 @register

@@ -103,10 +103,9 @@ def train_adversary(given: Given, policy: MlpPolicy, samples: int, turn: int) ->
     task, settings = given.task, given.training("ppo")
     shares = given.noise("uniform").against(task, None).shares
     limits = given.eps * np.abs(shares)
-    core = BatchedEnv(task, settings.envs, max_steps=settings.episode)
     model = PPO(
         "MlpPolicy",
-        _AdversaryEnv(core, policy, limits),
+        _AdversaryEnv(environment(given).core, policy, limits),
         seed=given.seed + turn,
         device="cpu",
         gamma=settings.gamma,

@@ -59,17 +59,21 @@ class Given:
         return self.run.settings.eps
 
     @property
+    def first(self) -> int:
+        """The number of samples that the trainings of stage 1 took."""
+        own, attempts = self.run.settings.stage1, range(self.run.arrivals.trainings)
+        return sum(own.attempt(k).samples for k in attempts) if isinstance(own, Training) else 0
+
+    @property
     def samples(self) -> int:
         """The number of samples that the trainings of the whole run took, which each alternative may take."""
-        s, trainings = self.run.settings, self.run.retraining.modes
-        first = 0
-        if isinstance(s.stage1, Training):
-            attempts = range(self.run.arrivals.trainings)
-            first = sum(s.stage1.attempt(number).samples for number in attempts)
-        return first + s.stage6.samples * sum(mode.attempts for mode in trainings)
+        trainings = sum(mode.attempts for mode in self.run.retraining.modes)
+        return self.first + self.run.settings.stage6.samples * trainings
 
     def training(self, algorithm: str | None = None) -> Training:
         """Returns the settings of stage 1 with all the samples, by default with the run's algorithm.
+
+        Where the task's reward led the policy of stage 1 to no goal, episodes are paid for as its own were.
 
         Raises:
             Unfit: the run has an agent in place of stage 1.
@@ -83,6 +87,8 @@ class Given:
                 self.task, s.preset, eps=s.eps, seed=s.seed, horizon=None, algorithm=algorithm
             ).stage1
             assert isinstance(own, Training)
+        if self.run.arrivals.shaped:
+            own = own.attempt(1)
         return replace(own, samples=self.samples)
 
     def noise(self, kind: str) -> Noise:

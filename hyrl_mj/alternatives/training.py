@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
@@ -14,7 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from hyrl_mj.alternatives.base import Given
 from hyrl_mj.gym_export import BatchedEnv
 from hyrl_mj.gym_export.sb3_env import TaskVecEnv
-from hyrl_mj.learning.training import spread_kinks, threads, with_settings
+from hyrl_mj.learning.training import TaskGround, spread_kinks, threads, with_settings
 from hyrl_mj.policies import Controller, Policy
 from hyrl_mj.simulation import AnyNoise
 
@@ -26,9 +27,11 @@ def environment(given: Given, noise: str | AnyNoise = "none") -> TaskVecEnv:
     """Returns the episodes of a training under noise, or a kind of it, as stage 1 has them."""
     settings = given.training("ppo")
     noise = given.noise(noise) if isinstance(noise, str) else noise
-    return TaskVecEnv(
-        BatchedEnv(given.task, settings.envs, noise=noise, max_steps=settings.episode)
+    paid = TaskGround(given.task, replace(settings, rehearse=0.0)).domain(settings.gamma)
+    core = BatchedEnv(
+        given.task, settings.envs, noise=noise, domain=paid, max_steps=settings.episode
     )
+    return TaskVecEnv(core)
 
 
 def learned(

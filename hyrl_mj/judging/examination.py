@@ -84,6 +84,7 @@ class Subject:
         effort: what may be spent.
         attacks: what signals an attack tries.
         alike: whether all of them answer as the controller "policy" does.
+        winnable: whether attacks begin at winnable starts alone, where the game tells which these are.
         curves: whether the game also tells margins, and what is won at all bounds.
     """
 
@@ -99,6 +100,7 @@ class Subject:
     effort: Effort
     attacks: AttackSettings = AttackSettings()
     alike: bool = False
+    winnable: bool = True
     curves: bool = True
 
 
@@ -178,7 +180,7 @@ def examine(
 
 def _winnable(subject: Subject, maps: Maps | None) -> tuple[Grid, np.ndarray] | None:
     """Returns the game's nodes with those (N,) bool that are winnable, None where that is not known."""
-    if maps is None or not subject.exact:
+    if maps is None or not (subject.exact and subject.winnable):
         return None
     classes = [*maps.map.values()][-1]  # of the hybrid controller
     return maps.grid(subject.task.chart), ~np.isin(classes, (MapClass.UNWINNABLE, MapClass.OVER))

@@ -10,6 +10,7 @@ from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 
@@ -140,7 +141,10 @@ def _without_outdated(found: Compared, task: Task, say: Say) -> Compared:
 
     kept = tuple(filter(is_of_now, found.rows))
     if gone := sorted({row.name for row in found.rows} - {row.name for row in kept}):
-        say(f"{', '.join(gone)}: left out, because their code or that of the task has changed")
+        say(
+            f"{', '.join(gone)}: left out, because their code or that of the task has changed or is in no "
+            "file"
+        )
     return replace(found, rows=kept)
 
 
@@ -148,10 +152,13 @@ def _code(task: Task, name: str) -> str:
     """Returns digests of the code that makes a row: of the package and the task, and of the alternative."""
     from hyrl_mj.alternatives import registered
 
-    module = type(registered()[name]).__module__ if name in registered() else ""
-    file = getattr(sys.modules.get(module), "__file__", None)
     common = sha256(f"{version('hyrl-mj')} {task.code}".encode()).hexdigest()
-    return common + (digest_of(Path(file)) if file else "")
+    if name not in registered():
+        return common
+    module = sys.modules.get(type(registered()[name]).__module__)
+    file = Path(getattr(module, "__file__", None) or "")
+    # What a notebook defines, or a script that is piped into Python, may be another each time.
+    return common + (digest_of(file) if file.is_file() else uuid4().hex)
 
 
 def _told(row: Row) -> str:
@@ -168,7 +175,7 @@ def judged(made: Run, name: str, *, seed: int) -> Row:
     from hyrl_mj.alternatives import registered
 
     kind = registered()[name]
-    row = Row(name, kind.title, seed, code=_code(made.task, name))
+    row = Row(name, kind.title[: compared.LONGEST_TITLE], seed, code=_code(made.task, name))
     try:
         return _made(made, row)
     except BadInput as error:  # the others go on
@@ -192,16 +199,23 @@ def _made(made: Run, row: Row) -> Row:
     candidates = [*registered()[row.name].candidates(Given(made.anew(), seed))]
     if not candidates or not all(isinstance(each, Candidate) for each in candidates):
         raise BadInput("candidates() yields no setting: let it yield a Candidate for each")
-    loops = [as_controller(each.acts) for each in candidates]
-    one = len(candidates) == 1
-    scores = [0.0 if one else _worst(made, loop, seed) for loop in loops]
-    number = int(np.argmax(scores))
+    tried = dict.fromkeys((each.label for each in candidates), 0.0)
+    if len(tried) < len(candidates) or (why := replace(row, tried=tried).why_not):
+        why = why if len(tried) == len(candidates) else "several settings of one label"
+        raise BadInput(
+            f"candidates() yields {why}: let it yield fewer, each with a short label of its own"
+        )
+    loops, number = [as_controller(each.acts) for each in candidates], 0
+    if len(candidates) > 1:
+        by_game = all(_playable(made, loop) for loop in loops)
+        scores = [_worst(made, loop, seed, by_game) for loop in loops]
+        tried, number = dict(zip(tried, scores, strict=True)), int(np.argmax(scores))
     best, seconds = candidates[number], time.monotonic() - began
     return replace(
         row,
         state="done",
         sentence=best.label,
-        tried={} if one else dict(zip([c.label for c in candidates], scores, strict=True)),
+        tried=tried if len(tried) > 1 else {},
         samples=best.samples,
         seconds=seconds,
         figures=figures_of(made, loops[number], seed),
@@ -213,14 +227,14 @@ def _playable(made: Run, controller: Controller) -> bool:
     return made.exact and not is_memory(memory_at_start(controller, 1))
 
 
-def _worst(made: Run, controller: Controller, seed: int) -> float:
+def _worst(made: Run, controller: Controller, seed: int, by_game: bool) -> float:
     """Returns the share of starts that a controller wins in the worst case that is found soon.
 
-    That is the game on the lattice of the curve where it can be played, else a short attack from other
-    starts than those of the examination. By this settings are chosen.
+    That is the game on the lattice of the curve where it can be played against all settings, else a short
+    attack from other starts than those of the examination. By this settings are chosen.
     """
     task, s = made.task, made.settings
-    if _playable(made, controller):
+    if by_game:
         grid = curve_grid(task, s.lattice)
         game = Game(task, made.split, {"one": controller}, s.eps, s.everywhere, grid)
         return game.score("one", s.eps).won
@@ -235,15 +249,17 @@ def figures_of(made: Run, controller: Controller, seed: int) -> dict[str, float]
     """Returns what an examination says of a controller, by name.
 
     These are: of the winnable starts the shares `proved`, and not `won` by any noise that is known
-    (`won_quiet` without noise), where the game can be played; of all starts that are attacked the shares
-    `worst`, won whatever the attack tried, and `lost_quiet`, lost without noise; of those that are won
-    without noise the shares `reached` under each kind of noise, and `late` under the worst of them; `miss`
-    [chart units], the median distance from the set-point at the end under uniform noise; and `variation`,
-    how far inputs go in a second there, as multiples of their range (median).
+    (`won_quiet` without noise), where the game can be played; of the `attacked` starts, which are the same
+    for all controllers, winnable or not, the shares `worst`, won whatever the attack tried, and
+    `lost_quiet`, lost without noise; of those that are won without noise the shares `reached` under each
+    kind of noise, and `late` under the worst of them; `miss` [chart units], the median distance from the
+    set-point at the end under uniform noise, of a task that tells one; and `variation`, how far inputs go in
+    a second there, as multiples of their range (median).
     """
     subject = replace(
         subject_of(made, {"one": controller}, made.split),
         playable=_playable(made, controller),
+        winnable=False,
         curves=False,
     )
     effort = subject.effort
@@ -252,7 +268,8 @@ def figures_of(made: Run, controller: Controller, seed: int) -> dict[str, float]
     )
     budget = Budget(rounds=effort.attack_rounds)
     result = examine(subject, options, budget).robustness
-    return {**_shares(result), **_manners(made, controller, seed)}
+    found = {**_shares(result), **_manners(made, controller, seed)}
+    return {name: value for name, value in found.items() if np.isfinite(value)}
 
 
 def _shares(result: Robustness) -> dict[str, float]:
@@ -267,7 +284,7 @@ def _shares(result: Robustness) -> dict[str, float]:
         if last.proved is not None:
             found["proved"] = last.proved
     for count in result.attacks:
-        found["lost_quiet"] = count.unaided / count.starts
+        found |= {"attacked": count.starts, "lost_quiet": count.unaided / count.starts}
         found["worst"] = 1 - (count.lost + count.unaided) / count.starts
     for one in result.comparisons:
         if one.compared:
@@ -287,5 +304,7 @@ def _manners(made: Run, controller: Controller, seed: int) -> dict[str, float]:
     moved = np.abs(np.diff(play.u, axis=0)) / (high - low)
     seconds = np.maximum(play.length - 1, 1) * task.dt
     variation = np.nansum(moved, axis=(0, 2)) / seconds
-    miss = task.miss(play.path[-1])
-    return {"miss": float(np.median(miss)), "variation": float(np.median(variation))}
+    found = {"variation": float(np.median(variation))}
+    if task.abilities.side_by_side is None:  # environments do not tell how far off they end
+        found["miss"] = float(np.median(task.miss(play.path[-1])))
+    return found

@@ -106,7 +106,7 @@ def sweep(
     common = Common(options.preset, options.horizon, options.set, options.all_coordinates)
     planned = [row for row, _ in jobs.values()]
     result = sweeps.opened(folder, common, planned)
-    rows = [row.on_disk(folder) for row in result.rows if row.name in jobs]
+    rows = [row.on_disk(folder, common) for row in result.rows if row.name in jobs]
     missing = [(row, jobs[row.name][1]) for row in rows if not row.done]
     with ExitStack() as stack:
         stack.enter_context(locked(folder))
@@ -125,10 +125,11 @@ def sweep(
             memory = options.memory
             with closing(cluster.work(engine, missing, share, memory, board.tell)) as ended:
                 for row in ended:
-                    row = row if row.state == "stopped" else _seen(row, folder)
+                    row = row if row.state == "stopped" else _seen(row, folder, common)
                     result = result.with_row(row)
                     result.save(folder)
                     board.end(row)
+        result = result.on_disk(folder)  # of the other runs, too
         write(result, folder)
     return result
 
@@ -143,11 +144,7 @@ def report(folder: str | Path) -> Sweep:
     folder = Path(folder)
     Sweep.load(folder)
     with locked(folder):
-        result = Sweep.load(folder)
-        for row in result.rows:
-            found = row.on_disk(folder)
-            told = row.state == "stopped" and found.state == "open"
-            result = result.with_row(row.stopped(row.sentence) if told else found)
+        result = Sweep.load(folder).on_disk(folder)
         write(result, folder)
     return result
 
@@ -209,9 +206,9 @@ def _check(names: tuple[str | Path, ...], options: SweepOptions) -> None:
     Number(0, 10_000, above=True).checked("memory", options.memory)
 
 
-def _seen(row: Row, folder: Path) -> Row:
+def _seen(row: Row, folder: Path, common: Common) -> Row:
     """Returns the row of a finished run, as this machine sees its run directory."""
-    row = row.on_disk(folder)
+    row = row.on_disk(folder, common)
     if row.state == "open":
         return row.stopped(
             f"this machine does not see its results: share {folder} between all machines"

@@ -103,15 +103,23 @@ class Compared:
         """Returns a figure of an alternative by seed, without the seeds that lack it."""
         return [row.figures[figure] for row in self.of(name) if figure in row.figures]
 
-    def difference(self, name: str, figure: str) -> Mean:
-        """Returns by how much more of a figure HyRL has than an alternative, in the seeds that both have.
+    def both(self, name: str) -> np.ndarray:
+        """Returns what an alternative and HyRL win under attack, and of how many starts (0 if not known).
+
+        These are rows (n, 3) of the seeds that both have.
+        """
+        other, hyrl = ({row.seed: row.figures for row in self.of(n)} for n in (name, "hyrl"))
+        pairs = [(other[s], hyrl[s]) for s in other if s in hyrl]
+        rows = [(a["worst"], b["worst"], b.get("attacked", 0.0)) for a, b in pairs]
+        return np.reshape(rows, (-1, 3))
+
+    def difference(self, name: str) -> Mean:
+        """Returns by how much more HyRL wins under attack than an alternative, in the seeds of `both`.
 
         It is NaN if they have none in common.
         """
-        other, hyrl = ({r.seed: r.figures.get(figure) for r in self.of(n)} for n in (name, "hyrl"))
-        pairs = [(other[seed], hyrl[seed], 0.0) for seed in other.keys() & hyrl.keys()]
-        both = [pair for pair in pairs if None not in pair]
-        return mean([np.array(both)], np.array((-1, 1))) if both else Mean(nan, None)
+        both = self.both(name)
+        return mean([both], np.array((-1, 1))) if len(both) else Mean(nan, None)
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -16,7 +16,10 @@ from hyrl_mj.files import artifacts
 from hyrl_mj.files.manifest import check_contents, may_hold
 from hyrl_mj.judging import by_kind
 from hyrl_mj.judging.game import LIMIT, Robustness
+from hyrl_mj.learning import Settings, changed, differing, preset
+from hyrl_mj.policies import ALGORITHMS
 from hyrl_mj.runs.directory import Run, load_run
+from hyrl_mj.tasks import described_task
 
 NAME = "sweep.json"
 MOST_RUNS = 1_000
@@ -85,21 +88,22 @@ class Row:
         """Whether the run is finished."""
         return self.state == "done"
 
-    def on_disk(self, folder: Path) -> Row:
-        """Returns the row with what its run directory holds: its results if it is finished, else none."""
+    def on_disk(self, folder: Path, common: Common) -> Row:
+        """Returns the row with what its run directory holds: its results if it is finished, else none.
+
+        A run of other settings than those of the row and of the sweep has none.
+        """
         row = Row(self.setting, self.seed, seconds=self.seconds)
         try:
-            run = finished_run(folder / self.name)
+            if (run := finished_run(folder / self.name)) is None:
+                return row
+            wanted = common.settings(self, run.settings)
         except BadInput as error:  # the task is in a file that may not be executed
             return row.stopped(str(error))
-        if run is None:
-            return row
-        own, other = self.setting, run.settings
-        named = Path(own.task).stem, own.eps, self.seed, own.algorithm or other.stage1.algorithm
-        found = Path(other.task).stem, other.eps, other.seed, other.stage1.algorithm
-        if found != named:
+        stem, differences = Path(run.settings.task).stem, ", ".join(differing(run.settings, wanted))
+        if differences or stem != Path(self.setting.task).stem:
             return row.stopped(
-                f"its folder holds a run of {found[0]}, {found[3]}, noise {other.eps:g}, seed {other.seed}: "
+                f"its folder holds a run of {stem} with other settings ({differences or 'another task'}): "
                 "put it back to where it was made, and remove what lies here"
             )
         verdict = run.verdict
@@ -124,6 +128,22 @@ class Common:
     horizon: float | None
     set: dict[str, Any]
     everywhere: bool = False
+
+    def settings(self, row: Row, found: Settings) -> Settings:
+        """Returns the settings that the run of a row has; those of a foreign algorithm as they were found."""
+        own, task = row.setting, described_task(found.task)
+        algorithm = own.algorithm or task.learning.algorithm
+        usual = algorithm in ALGORITHMS
+        made = preset(
+            task, self.preset, eps=own.eps, seed=row.seed, horizon=self.horizon,
+            algorithm=algorithm if usual else None,
+        )  # fmt: skip
+        if not usual:
+            named = found.stage1.algorithm == algorithm
+            stage1 = found.stage1 if named else replace(made.stage1, algorithm=algorithm)
+            made = replace(made, stage1=stage1, stage6=found.stage6)
+        made = replace(made, task=found.task, everywhere=self.everywhere)
+        return changed(made, self.set) if self.set else made
 
     def texts(self) -> dict[str, str]:
         """Returns the settings as they are typed, by option."""
@@ -186,6 +206,16 @@ class Sweep:
         """Writes `sweep.json`."""
         artifacts.write_json(folder / NAME, self, kind="sweep")
 
+    def on_disk(self, folder: Path) -> Sweep:
+        """Returns the sweep with what the run directories hold; what has stopped runs stays told."""
+
+        def seen(row: Row) -> Row:
+            found = row.on_disk(folder, self.common)
+            told = row.state == "stopped" and found.state == "open"
+            return row.stopped(row.sentence) if told else found
+
+        return replace(self, rows=tuple(map(seen, self.rows)))
+
     def with_row(self, row: Row) -> Sweep:
         """Returns the sweep with another row of the same name."""
         rows = tuple(row if row.name == other.name else other for other in self.rows)
@@ -205,7 +235,7 @@ class Sweep:
                 task, algorithm = _plain(row.setting.task), _plain(row.setting.algorithm)
                 values = [row.seed, row.state, _plain(row.verdict), f"{row.seconds:.6g}"]
                 found = [row.figures.get(name) for name in names]
-                cells = ["" if value is None else f"{value:.6g}" for value in found]
+                cells = ["" if value is None else f"{value}" for value in found]
                 sentence = _plain(row.sentence)
                 writer.writerow([task, algorithm, row.setting.eps, *values, *cells, sentence])
 
@@ -291,10 +321,13 @@ def _figures(robustness: Robustness, timed: bool = True) -> dict[str, float | No
         for who in ("policy", "hyrl", LIMIT):
             score = game.scores[who][i]
             kinds = ("won",) if who == LIMIT else ("won", "proved", "not_broken")
+            replays = None if when else game.replays_of(who)
             for kind in kinds:
-                figures[f"{who}_{kind}{when}"] = getattr(score, kind)
-                if who != "policy":
-                    figures[f"{who}_{kind}_any{when}"] = getattr(score, f"{kind}_any")
+                # What is lost where it is played in MuJoCo is not won, whatever the game says.
+                refuted = kind != "won" and replays and replays.failures
+                for some in ("",) if who == "policy" else ("", "_any"):
+                    name = f"{who}_{kind}{some}{when}"
+                    figures[name] = None if refuted else getattr(score, f"{kind}{some}")
     figures |= {"hyrl_time": last.time, "hyrl_time_any": last.time_any}
     figures |= {"hyrl_proved_time": last.proved_time, "hyrl_proved_time_any": last.proved_time_any}
     if last.excursion is not None:
@@ -309,6 +342,8 @@ def _compared(robustness: Robustness, timed: bool = True) -> dict[str, float]:
     """Returns what comparisons from the same starts tell of both controllers, of the worst kind of noise."""
     figures: dict[str, float] = {}
     for compared in robustness.comparisons:
+        if " " in compared.noise:  # a sum or a log, with other bounds than the run
+            continue
         n, attack = compared.compared, compared.noise == "attack"
         if attack:
             for who, lost in compared.unaided.items():

@@ -309,10 +309,12 @@ def noise_of(task: Task, text: str, bound: float, everywhere: bool = False) -> N
     word, _, rest = text.strip().partition(" ")
     noise: NamedNoise
     if word == LOG and rest:
-        log, chart = Log(path := Path(rest.strip())), task.chart
+        log, chart = Log(path := rest.strip()), task.chart
+        # What the log tells of others is no noise of this robot.
+        own = [name for name in chart.names if {name, f"{name}_ref"} <= {*log.names}]
         sides = zip(chart.names, chart.sides.tolist(), chart.periodic, strict=True)
-        turns = {name: side for name, side, turns in sides if turns and name in log.names}
-        noise = replace(noise_from_log(log, turn=turns), kind=f"{word} {path.name}")
+        turns = {name: side for name, side, turns in sides if turns and name in own}
+        noise = replace(noise_from_log(log, columns=own, turn=turns), kind=f"{word} {path}")
     else:
         noise = Sensor.parse(text) if rest else Noise(text, bound, everywhere)
     if rest and everywhere:

@@ -2,31 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 
 import numpy as np
 
+from hyrl_mj.errors import counted
 from hyrl_mj.judging.game import percent
 from hyrl_mj.runs.compared import Compared, Row
 from hyrl_mj.viz.tables import Table, print_table, spread
 
-# The figures in the table, with the headings of their columns and whether they are shares.
-COLUMNS = {
-    "worst": ("won under attack", True),
-    "won": ("won in the game", True),
-    "proved": ("proved", True),
-    "lost_quiet": ("lost without noise", True),
-    "late": ("late", True),
-    "miss": ("off the set-point", False),
-    "variation": ("variation of inputs [1/s]", False),
+# The texts of numbers, and of shares that are not proved.
+_number, _tried = "{:.3g}".format, partial(percent, surely=False)
+# The figures in the table, with the headings of their columns and the texts of their values.
+COLUMNS: dict[str, tuple[str, Callable[[float], str]]] = {
+    "worst": ("won under attack", _tried),
+    "won": ("won in the game", _tried),
+    "proved": ("proved", percent),
+    "lost_quiet": ("lost without noise", percent),
+    "late": ("late", percent),
+    "miss": ("off the set-point", _number),
+    "variation": ("variation of inputs [1/s]", _number),
 }
 BRIEF = ("worst", "won", "lost_quiet", "late")
 
 
 def ranked(compared: Compared) -> list[str]:
-    """Returns the names of the alternatives that have results, the best first."""
-    done = [name for name in compared.names if compared.of(name)]
+    """Returns the names of the alternatives that have results, the best first; HyRL follows its equals."""
+    done = sorted((n for n in compared.names if compared.of(n)), key=lambda name: name == "hyrl")
     return sorted(done, key=lambda name: [-_middle(compared, name, f) for f in ("worst", "won")])
 
 
@@ -41,15 +44,17 @@ def result_table(compared: Compared, brief: bool = False) -> Table:
 
     A brief one, for terminals, holds what decides alone.
     """
-    rows = []
+    rows, seeds = [], {row.seed for row in compared.rows}
     for name in ranked(compared):
         of = compared.of(name)
         row = {"alternative": of[0].title}
+        if len(of) < len(seeds):
+            row["alternative"] += f", {len(of)} of {counted(len(seeds), 'seed')}"
         if not brief:
             row["setting"] = _settings(of)
-        for figure, (heading, share) in COLUMNS.items():
+        for figure, (heading, show) in COLUMNS.items():
             if (figure != "late" or compared.lasting) and (figure in BRIEF or not brief):
-                row[heading] = _cell(compared.values(name, figure), share)
+                row[heading] = _cell(compared.values(name, figure), show, len(of))
         if not brief:
             row["samples trained"] = f"{np.mean([r.samples for r in of]):,.0f}"
             row["seconds"] = f"{np.mean([r.seconds for r in of]):.0f}"
@@ -64,12 +69,13 @@ def _settings(rows: list[Row]) -> str:
     return "; ".join(sorted(dict.fromkeys(taken), key=taken.count, reverse=True))
 
 
-def _cell(values: list[float], share: bool) -> str:
-    """Returns the mean of values, and their range if they differ."""
+def _cell(values: list[float], show: Callable[[float], str], seeds: int = 0) -> str:
+    """Returns the mean of values, their range if they differ, and of how many seeds there is none."""
     if not values:
         return "-"
-    show = partial(percent, surely=False) if share else "{:.3g}".format
-    return spread(float(np.mean(values)), (min(values), max(values)), show)
+    text = spread(float(np.mean(values)), (min(values), max(values)), show)
+    missing = seeds - len(values)
+    return f"{text}, none in {missing} of {counted(seeds, 'seed')}" if missing > 0 else text
 
 
 def tried_table(compared: Compared) -> Table | None:
@@ -81,7 +87,7 @@ def tried_table(compared: Compared) -> Table | None:
             won = [row.tried[label] for row in of if label in row.tried]
             chosen = sum(row.sentence == label for row in of)
             taken = f"{chosen} of {len(won)}"
-            rows.append([of[0].title, label, _cell(won, True), taken])
+            rows.append([of[0].title, label, _cell(won, _tried), taken])
     headings = ("alternative", "setting", "won when it was chosen", "taken, seeds")
     note = (
         "The share of the winnable starts that each setting wins in the game, or of other starts under a "
@@ -95,21 +101,22 @@ def sentences(compared: Compared) -> Iterator[str]:
     """Yields how HyRL compares with the best alternative, and which ones could not be compared."""
     others = [n for n in ranked(compared) if n not in ("hyrl", "policy")]
     best = others[0] if others else "hyrl"
-    mean = compared.difference(best, "worst")
-    if others and np.isfinite(mean.value):
+    mean, both = compared.difference(best), compared.both(best)
+    if others and len(both):
         title = compared.of(best)[0].title
-        wins, hyrl = (f"{100 * _middle(compared, n, 'worst'):.2f}%" for n in (best, "hyrl"))
-        between = ""
+        wins, hyrl = (f"{100 * share:.2f}%" for share in both.mean(axis=0)[:2])
+        between, count = "", len({row.seed for row in compared.rows})
+        seeds = f", in {len(both)} of {count} seeds" if len(both) < count else ""
         if mean.interval is not None and np.ptp(mean.interval):
             low, high = (f"{100 * end:+.2f}" for end in mean.interval)
             between = f" (95% interval {low} to {high})"
         word = "as many"
-        if mean.value:
+        if abs(mean.value) > 1e-9:
             more = "more" if mean.value > 0 else "less"
             word = f"{100 * abs(mean.value):.2f} percentage points {more}"
         yield (
             f"The best alternative is {title}, which wins from {wins} of the starts under attack; HyRL wins "
-            f"from {hyrl}, {word}{between}."
+            f"from {hyrl}, {word}{between}{seeds}."
         )
     for row in compared.rows:
         if row.state == "unfit":

@@ -134,10 +134,12 @@ def _draw(panel: Axes, curves: list[Curve]) -> None:
     """Draws the median and the band of each controller."""
     eps = np.array(curves[0].eps)
     alike = [curve.wins for curve in curves if curve.eps == curves[0].eps]
+    # Of controllers that could not be bounded nothing is proved: what they win on the nodes is drawn.
+    kind = "proved" if all(wins["hyrl"].proved for wins in alike) else "won"
     for who, column, label, colour, dashes in (  # of `WinningShares`
         ("policy", "won", "RL policy", colours.POLICY, "-"),
-        ("hyrl", "proved", "HyRL proved, own q0", colours.MODES[0], "-"),
-        ("hyrl", "proved_any", "HyRL proved, any q0", colours.MODES[0], "--"),
+        ("hyrl", kind, f"HyRL {kind}, own q0", colours.MODES[0], "-"),
+        ("hyrl", f"{kind}_any", f"HyRL {kind}, any q0", colours.MODES[0], "--"),
     ):
         shares = 100 * np.array([getattr(wins[who], column) for wins in alike])
         panel.fill_between(

@@ -71,7 +71,7 @@ COLUMNS = {
     **_both("margin"),
     "hyrl_proved_time": Column("latest arrival proved, own q0", "{:.2f} s".format),
     "hyrl_proved_time_any": Column("latest arrival proved, any q0", "{:.2f} s".format, False),
-    "hyrl_excursion": Column("excursion", _number, False),
+    "hyrl_excursion": Column("excursion", _number),  # which is missing where each run ends
     "hyrl_miss_without_noise": Column("HyRL off the set-point, no noise", _number, False),
     **_both(*list(FIGURES)[3:]),
 }

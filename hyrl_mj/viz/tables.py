@@ -500,7 +500,8 @@ def print_noise(noise: LogNoise) -> None:
     if len({column.text for column in noise.columns}) > 1:
         for column in noise.columns:
             print(f"{column.name}: {column.text}")
-    print(f'hyrl-mj run TASK --noise "{noise.text}"')
+    none = "it shows no noise, so no run is made for it: a bound that covers more is given by --eps"
+    print(none if noise.text == "none" else f'hyrl-mj run TASK --noise "{noise.text}"')
 
 
 def print_table(table: Table) -> None:
