@@ -208,6 +208,17 @@ def test_a_heavy_penalty_makes_the_policy_flat(given, kind):
     assert steep[1e4] < steep[0.0] / 2
 
 
+def test_a_training_that_breaks_off_is_one_sentence(given, monkeypatch):
+    def broken(self):
+        raise ValueError("the parameter loc holds nan")
+
+    monkeypatch.setattr("stable_baselines3.PPO.train", broken)
+    with pytest.raises(BadInput, match=r"its training broke off after .* samples .*holds nan"):
+        learned(
+            given, environment(given), lambda model: PolicyController(export(model, given.task))
+        )
+
+
 # ---- mixture
 
 

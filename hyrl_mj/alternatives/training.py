@@ -13,6 +13,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from hyrl_mj.alternatives.base import Given
+from hyrl_mj.errors import BadInput, HyrlError, brief
 from hyrl_mj.gym_export import BatchedEnv
 from hyrl_mj.gym_export.sb3_env import TaskVecEnv
 from hyrl_mj.learning.training import TaskGround, spread_kinks, threads, with_settings
@@ -61,6 +62,9 @@ def learned(
         start: weights to begin with, by default new ones.
         options: arguments of the algorithm to change.
         of_policy: arguments of the policy to change.
+
+    Raises:
+        BadInput: the training broke off.
     """
     settings, best = given.training("ppo"), _Best(given, acting)
     arguments = {**settings.options, **options}
@@ -70,7 +74,16 @@ def learned(
             spread_kinks(model.policy, given.task, given.seed)
         if start is not None:
             model.policy.load_state_dict(start)
-        model.learn(samples or settings.samples, callback=best)
+        try:
+            model.learn(samples or settings.samples, callback=best)
+        except (HyrlError, OSError):
+            raise
+        except (
+            Exception
+        ) as error:  # whatever SB3 and torch raise, as of weights that are not finite
+            raise BadInput(
+                f"its training broke off after {model.num_timesteps:,} samples ({brief(error)})"
+            ) from error
     model.policy.load_state_dict(best.state)
     return model
 
