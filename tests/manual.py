@@ -303,12 +303,13 @@ def main(pages: list[Path]) -> int:
     """
     from attacks import child, small
 
-    from hyrl_mj.viz import viewing
+    from hyrl_mj.viz import live, viewing
 
     small.import_late()
     shorten()
     # A viewer waits for a person, and the loops of a robot for the time to pass.
     viewing.view = lambda *arguments: print("viewed", arguments[1])
+    live.live = lambda *arguments: print("served", arguments[0])
     made = child(lambda: call(shortened(["run", "vehicle"])), Path.cwd(), seconds=300)
     assert made.status == 0, made.out + made.err
 

@@ -511,7 +511,9 @@ def test_runs_in_a_field_have_a_longest_time_together(tmp_path):
     }
     path = tmp_path / "long.json"
     path.write_text(json.dumps(field))
-    with pytest.raises(BadInput, match="100 starts with runs of 3600 s each: give at most 100,000"):
+    with pytest.raises(
+        BadInput, match="100 starts with runs of 3600 s each, and 1 post.*: give at most 100,000"
+    ):
         read_field(path)
     path.write_text(json.dumps(field | {"time_s": 900}))
     assert len(read_field(path).starts) == 100

@@ -390,8 +390,9 @@ def drive(
 def view(run: Run, *, arc: str | None = None, port: int = 0) -> None:
     """Simulate a run live in a browser, or replay an arc.
 
-    On the page the start is dragged, and controller, mode, noise and bound are chosen. It takes
-    pip install "hyrl-mj[view]". Ctrl+C ends it.
+    On the page, drag the start, and choose controller, mode and noise.
+
+    It takes pip install "hyrl-mj[view]". Ctrl+C ends it.
 
     Args:
         arc: the name of a file in the folder arcs of the run, to replay in MuJoCo's viewer, or in a browser

@@ -19,7 +19,7 @@ Work = Callable[[], object]
 FIELD = {
     "goal_m": [4.0, 0.0],
     "posts": [{"radius_m": 0.3, "positions_m": [[2.0, 0.1]]}],
-    "starts": [{"position_m": [0.0, 0.0], "heading_rad": 0.0}],
+    "starts": [{"position_m": [3.2, 0.0], "heading_rad": 0.0}],
     "time_s": 1.0,
 }
 ARGUMENTS = {"pinned": {"qpos[2]": -0.15, "qpos[3]": 0.0}, "success": "reward >= 1"}
