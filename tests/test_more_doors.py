@@ -512,7 +512,7 @@ def test_runs_in_a_field_have_a_longest_time_together(tmp_path):
     path = tmp_path / "long.json"
     path.write_text(json.dumps(field))
     with pytest.raises(
-        BadInput, match="100 starts with runs of 3600 s each, and 1 post.*: give at most 100,000"
+        BadInput, match=r"100 starts with runs of 3600 s each, and 1 post.*: give at most 100,000"
     ):
         read_field(path)
     path.write_text(json.dumps(field | {"time_s": 900}))
