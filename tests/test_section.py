@@ -117,3 +117,10 @@ def test_what_lies_on_the_floor_is_below_who_flies(puck):
     np.testing.assert_array_equal(laid[:, :2], points[:, :2])
     assert 0 < laid[0, 2] < 0.02
     assert laid[1, 2] == 0.012
+
+
+def test_where_there_is_no_critical_set_there_is_none_in_the_plane(cube):
+    nothing = hyrl_mj.CriticalSet(np.empty((0, 3)), np.zeros(0, dtype=int), 0.01, 0.1)
+    section = Section(cube)
+    found = section.critical_set(SimpleNamespace(task=cube, critical_set=nothing))
+    assert section.lift(found.points).shape == (0, 3)

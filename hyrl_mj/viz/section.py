@@ -141,8 +141,9 @@ def sections(task: Task) -> tuple[int | None, list[Section]]:
 
 def critical_sets(run: Run, cuts: Sequence[Section]) -> list[CriticalSet]:
     """Returns M* of a run in sections of one chart, searched for by outcome in all of them at once."""
-    if not (cuts[0].cut and len(run.critical_set.points)):
-        return [run.critical_set] * len(cuts)
+    whole = run.critical_set
+    if not (cuts[0].cut and len(whole.points)):
+        return [replace(whole, points=whole.points[:, :2])] * len(cuts)
     resolution, eps = run.settings.resolution, run.settings.eps
     grid = Grid.with_cells(cuts[0].chart, max(run.settings.rods, CELLS))
     nodes = np.vstack([cut.lift(grid.nodes) for cut in cuts])
