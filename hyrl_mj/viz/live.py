@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.runs.arcs import OF_RUNS, noisy_arcs
+from hyrl_mj.runs.arcs import OF_RUNS, critical_starts, noisy_arcs
 from hyrl_mj.runs.directory import Run
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import noise_kinds
@@ -145,6 +145,8 @@ class Page:
             bound = self.bound.value
             arcs = noisy_arcs(self.run, z0, self.noise.value, bound, (q0,), seed=self._seed)
         except BadInput as error:
+            if not hasattr(self, "track"):  # there is nothing else to show
+                raise
             self.told.content = f"**{error}**"
             return
         found = {name.split("_")[0]: arc for name, (arc,) in arcs.items()}
@@ -178,8 +180,7 @@ class Page:
     @cached_property
     def _first(self) -> np.ndarray:
         """The start (d,) with which the page begins: on M*, or that of the scene."""
-        points = self.run.critical_set.points
-        return np.asarray(points[0] if len(points) else self.run.task.scene.starts[0], dtype=float)
+        return np.array([*critical_starts(self.run), *self.run.task.scene.starts][0], dtype=float)
 
     @cached_property
     def _places(self) -> tuple[np.ndarray, np.ndarray]:

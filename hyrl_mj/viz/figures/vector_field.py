@@ -27,7 +27,7 @@ def vector_field(run: Run) -> Figure:
     """Draws the vector fields of the closed loops without noise: the policy's, and each mode's in its set.
 
     An arrow is the motion of the chart point in one sample. Of a chart with more than two coordinates a
-    section is shown, and of a robot with inertia the motion from rest.
+    section is shown, and of a robot with inertia the motion from the state in which an episode begins there.
 
     Args:
         run: whose stages up to the policies of the modes are finished.
@@ -63,8 +63,13 @@ def vector_field(run: Run) -> Figure:
             if members is not None and not ring:
                 charts.region(panel, members, f"{colour}20")
             longest = np.nanmax(np.linalg.norm(arrows, axis=1), initial=1e-9)
-            arrows = 0.9 * arrows / longest * (1 if ring else grid.spacing.max())
-            (_ring if ring else _plane)(panel, section, z, arrows, colour, critical)
+            arrows = 0.9 * arrows / longest
+            if ring:
+                at, arrows = _along(section, z, arrows)
+            else:
+                at, arrows = z, arrows * grid.spacing.max()
+            _background(panel, section, critical)
+            panel.quiver(*at.T, *arrows.T, color=colour, **LOOKS)
         for panel in axes[len(panels) :]:
             panel.set_axis_off()
         style.legend(figure)
@@ -79,34 +84,22 @@ def one_sample(task: Task, policy: Policy, z: np.ndarray) -> np.ndarray:
     return task.chart.difference(task.z(plant.measurement), z)
 
 
-def _plane(
-    panel: Axes,
-    section: Section,
-    z: np.ndarray,
-    arrows: np.ndarray,
-    colour: str,
-    critical: np.ndarray,
-) -> None:
-    """Draws arrows (n, 2) at points (n, 2) of a plane."""
-    charts.plane(panel, section)
-    panel.quiver(*z.T, *arrows.T, color=colour, **LOOKS)
-    charts.dots(panel, critical, BAD)
-
-
-def _ring(
-    panel: Axes,
-    section: Section,
-    z: np.ndarray,
-    arrows: np.ndarray,
-    colour: str,
-    critical: np.ndarray,
-) -> None:
-    """Draws arrows (n, 1) at values (n, 1) of a periodic coordinate along a ring."""
-    charts.ring(panel, section.chart, (OUTER, INNER))
+def _along(section: Section, z: np.ndarray, arrows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns points (n, 2) on a ring, and arrows (n, 2) along it, for values and arrows (n, 1)."""
     x, y = charts.on_ring(section.chart, z[:, 0])
     middle = (OUTER + INNER) / 2
-    along = arrows[:, 0] * 2 * np.pi * middle / RING * np.array([-y, x])
-    panel.quiver(middle * x, middle * y, *along, color=colour, **LOOKS)
+    return middle * np.column_stack([x, y]), arrows * 2 * np.pi * middle / RING * np.column_stack(
+        [-y, x]
+    )
+
+
+def _background(panel: Axes, section: Section, critical: np.ndarray) -> None:
+    """Draws the plane or the ring, with set-point and M*."""
+    if not charts.is_ring(section.chart):
+        charts.plane(panel, section)
+        charts.dots(panel, critical, BAD)
+        return
+    charts.ring(panel, section.chart, (OUTER, INNER))
     charts.spokes(panel, section.chart, critical, INNER - 0.06, BAD)
     if section.set_point is not None:
         charts.cross(panel, *np.ravel(charts.on_ring(section.chart, section.set_point)))
