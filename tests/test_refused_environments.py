@@ -581,6 +581,16 @@ class Since(Puck):
         return bool(np.linalg.norm(self.data.qpos - self.begun) > 0.3)
 
 
+class Tide(Puck):
+    """It has a border that follows no sum of its place, so that few runs of other resets end as early."""
+
+    def begin(self, place):
+        self.wave = float(np.sin(3 * place[0]))
+
+    def crashed(self):
+        return self.wave > 0.3 and abs(self.data.qpos[1]) > 1.0
+
+
 class Worn(Puck):
     """Its motors wear out a little at each reset, by as much as the reset draws."""
 
@@ -672,6 +682,7 @@ DRAWN = {
     "of a global generator": (Global, {"seed": 0}, "draws goal from a global generator"),
     "of its own": (OwnGenerator, {}, r"in reset\(\), from a generator .* not decide \(rng\)"),
     "where it began": (Since, {}, "each reset of Since draws begun"),
+    "a border of its place": (Tide, {"steps": 60}, "each reset of Tide draws wave"),
     "wear": (Worn, {}, "draws actuator_gainprm of its model"),
     "activations": (
         Lagging, {}, f"Lagging changes .* {OUTLASTS.format(ACT)}.* mj_resetData",

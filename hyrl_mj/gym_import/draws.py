@@ -109,10 +109,12 @@ def _drawn(instance: Instance, resets: Resets) -> list[str]:
     differ = [name for name in changed if name not in passed and "_seed" not in name]
     sizes = np.abs(told[np.isfinite(told)])
     most = 1e-9 * max(float(sizes.max(initial=0.0)), 1.0)
+    pairs = [
+        (other, told if i < COMPARED else told[: len(other)]) for i, (_, other) in enumerate(begun)
+    ]
     if all(
-        np.array_equal(other.shape, told.shape if i < COMPARED else other.shape)
-        and np.allclose(other, told[: len(other)], rtol=0, atol=most, equal_nan=True)
-        for i, (_, other) in enumerate(begun)
+        a.shape == b.shape and np.allclose(a, b, rtol=0, atol=most, equal_nan=True)
+        for a, b in pairs
     ):
         if differ:
             _keep(
