@@ -416,11 +416,13 @@ def test_bad_forms_and_places(circle, tmp_path):
             FORMS[form](controller, tmp_path / "file" / "x")
     with pytest.raises(BadInput, match="a place that can be written"):
         FORMS["onnx"](controller, tmp_path)
-    (tmp_path / "controller.py").write_text("mine")
-    with pytest.raises(BadInput, match="exists and is no exported controller"):
-        FORMS["numpy"](controller, tmp_path)
-    assert (tmp_path / "controller.py").read_text() == "mine"
-    assert {p.name for p in tmp_path.iterdir()} == {"file", "controller.py"}
+    for name in ("controller.py", "controller.npz"):
+        (mine := tmp_path / name).write_text("mine")
+        with pytest.raises(BadInput, match=f"{name} exists and is no exported controller"):
+            FORMS["numpy"](controller, tmp_path)
+        assert mine.read_text() == "mine"
+        assert {p.name for p in tmp_path.iterdir()} == {"file", name}
+        mine.unlink()
 
 
 def test_without_onnx_it_says_what_to_install(circle, tmp_path, monkeypatch):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from hashlib import sha256
 from pathlib import Path
 from runpy import run_path
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hyrl_mj.errors import BadInput, brief, unknown
+from hyrl_mj.errors import BadArtifact, BadInput, brief, unknown
 from hyrl_mj.export.source import write_function
 from hyrl_mj.fields import FocusController, exported_controller
 from hyrl_mj.files import artifacts
@@ -48,10 +48,8 @@ def export_numpy(
         BadInput: the controller cannot be exported, or the files cannot be written.
     """
     controller, folder = exported_controller(controller, field), Path(folder)
-    path = folder / TEMPLATE.name
-    first_line = TEMPLATE.read_text(encoding="utf-8").partition("\n")[0]
-    if path.exists() and first_line not in path.read_text(encoding="utf-8", errors="replace"):
-        raise BadInput(f"{path} exists and is no exported controller: choose another folder")
+    if taken := next((path for path in files_of("numpy", folder) if not _is_free(path)), None):
+        raise BadInput(f"{taken} exists and is no exported controller: choose another folder")
     with tempfile.TemporaryDirectory() as temporary:
         written = _write(controller, Path(temporary))
         _check(controller, run_path(str(written[0]))["step"], "the NumPy form")
@@ -60,6 +58,18 @@ def export_numpy(
                 partial = stack.enter_context(artifacts.replacing(folder / source.name))
                 partial.write_bytes(source.read_bytes())
     return [folder / source.name for source in written]
+
+
+def _is_free(path: Path) -> bool:
+    """Returns whether there is no file, or one of a controller that was exported."""
+    if not path.exists():
+        return True
+    if path.suffix == ".npz":
+        with suppress(BadArtifact):
+            return bool(artifacts.read_arrays(path, kind="controller"))
+        return False
+    first_line = TEMPLATE.read_text(encoding="utf-8").partition("\n")[0]
+    return first_line in path.read_text(encoding="utf-8", errors="replace")
 
 
 def export_onnx(controller: Exportable, path: str | Path, field: str | Path | None = None) -> Path:
