@@ -19,7 +19,13 @@ from hyrl_mj.tasks import SPARING
 from hyrl_mj.viz.commands import commands
 from hyrl_mj.viz.report import render
 from hyrl_mj.viz.shows import replay_shows
-from hyrl_mj.viz.tables import attack_table, comparison_table, print_robustness, robustness_sentence
+from hyrl_mj.viz.tables import (
+    attack_table,
+    comparison_table,
+    print_robustness,
+    robustness_sentence,
+    robustness_tables,
+)
 
 FEW = {"episodes": 20, "noise": ("none", "uniform")}
 
@@ -107,6 +113,17 @@ def test_the_rounds_of_a_time_repeat_it(copied):
         f"--attack-rounds {rounds} --attack-starts 100 --seed 0"
         in commands(load_run(copied), again)[-1]
     )
+
+
+def test_an_examination_near_the_critical_set_counts_for_no_other(copied):
+    run = load_run(copied)
+    assert run.is_examined_as_usual
+    options = ExamineOptions(**FEW, near_critical=True, attack_rounds=1, attack_starts=9)
+    again = examine_run(run, options, say=str)
+    assert not load_run(copied).is_examined_as_usual
+    assert "--near-critical" in commands(load_run(copied), again)[-1]
+    notes = [str(table.note) for table in robustness_tables(run.task, again)]
+    assert any("All of the starts lie near the critical set." in note for note in notes)
 
 
 @pytest.mark.parametrize("options", [{"attack_rounds": -1}, {"attack_starts": 0}])

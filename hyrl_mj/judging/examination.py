@@ -156,7 +156,10 @@ def examine(
         counts, comparisons = noisy_episodes(
             task, regions, subject.controllers, noises, count, options.seed
         )
-    results = Robustness(eps, everywhere, game, counts, options.seed, comparisons=comparisons)
+    results = Robustness(
+        eps, everywhere, game, counts, options.seed,
+        comparisons=comparisons, near_critical=options.near_critical,
+    )  # fmt: skip
     if budget is None:
         return Examination(results, maps)
     starts = options.attack_starts or subject.effort.attack_starts

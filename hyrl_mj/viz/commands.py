@@ -53,6 +53,8 @@ def _examination(robustness: Robustness) -> str:
     command = ["hyrl-mj", "robustness", "RUN", "--eps", f"{robustness.eps}"]
     if robustness.everywhere:
         command.append("--all-coordinates")
+    if robustness.near_critical:
+        command.append("--near-critical")
     counts = robustness.episodes
     if counts:
         kinds = list(dict.fromkeys(c.noise for c in counts))

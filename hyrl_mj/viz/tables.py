@@ -157,7 +157,10 @@ def robustness_tables(task: Task, robustness: Robustness) -> list[Table]:
     if robustness.episodes:
         tables.append(episode_table(task, robustness.episodes))
     if robustness.attacks:
-        tables += [attack_table(task, robustness.attacks), signals_table(task, robustness.attacks)]
+        tables += [
+            attack_table(task, robustness.attacks, robustness.near_critical),
+            signals_table(task, robustness.attacks),
+        ]
     if robustness.comparisons and len(robustness.comparisons[0].lost) > 1:
         tables.append(comparison_table(task, robustness.comparisons))
     return tables
@@ -308,7 +311,7 @@ def episode_table(task: Task, counts: Sequence[EpisodeCount]) -> Table:
     return Table.of(f"{task.name}: noisy episodes", rows, note)
 
 
-def attack_table(task: Task, counts: Sequence[AttackCount]) -> Table:
+def attack_table(task: Task, counts: Sequence[AttackCount], near_critical: bool = False) -> Table:
     """Returns from how many starts the attack found a signal that makes controllers lose: a row for each."""
     rows = []
     for c in counts:
@@ -330,9 +333,9 @@ def attack_table(task: Task, counts: Sequence[AttackCount]) -> Table:
     noise = task.noise_text(counts[0].eps, counts[0].everywhere)
     title = f"{task.name}: attack, a search for noise of up to {noise}"
     note = (
-        "Half of the starts lie near the critical set. Every loss has been repeated with its recorded noise "
-        "signal. The interval is that of the share. That the attack finds nothing is no proof that there is "
-        "nothing."
+        f"{'All' if near_critical else 'Half'} of the starts lie near the critical set. Every loss has been "
+        "repeated with its recorded noise signal. The interval is that of the share. That the attack finds "
+        "nothing is no proof that there is nothing."
     )
     return Table.of(title, rows, note)
 

@@ -284,6 +284,7 @@ class Robustness(artifacts.SavedAsJson):
         seed: seed of the starts and the noise of these episodes and attacks.
         attacks: counts of the attack, one for each controller, if there was one.
         comparisons: of the controllers, from the same starts, by kind of noise; that of the attack is last.
+        near_critical: whether all episodes and the attack begin near the critical set.
     """
 
     KIND: ClassVar[str] = "robustness"
@@ -295,6 +296,7 @@ class Robustness(artifacts.SavedAsJson):
     seed: int
     attacks: tuple[AttackCount, ...] = ()
     comparisons: tuple[Comparison, ...] = ()
+    near_critical: bool = False
 
     @property
     def deciding(self) -> GameResult | None:
