@@ -217,6 +217,16 @@ def test_frames_do_not_depend_on_those_before(crash, jump, camera):
 
 
 @needs_gl
+def test_a_path_beyond_what_the_camera_shows_is_in_the_picture(jump):
+    far = Track(TASK, jump)
+    far.points = 4 * far.points
+    _, usual = drawn([Track(TASK, jump)], 0.0)
+    _, pixel = drawn([far], 0.0)
+    assert usual(far.points).max() > 320
+    assert 0 <= pixel(far.points).min() <= pixel(far.points).max() <= 320
+
+
+@needs_gl
 def test_nothing_is_left_where_a_capsule_was(jump):
     """It is longer than its numbers tell."""
     spec = mujoco.MjSpec.from_file(str(models_dir() / "vehicle.xml"))

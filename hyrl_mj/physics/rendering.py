@@ -135,9 +135,14 @@ class SceneRenderer:
         canvas: canvas of this model, at least as large; by default a new one, which takes 0.1 s.
         mocap: where the mocap bodies are, see `mjcf.mocap_poses`; by default they stay.
 
+    Attributes:
+        widening: by how much more the camera sees than that.
+
     Raises:
         BadInput, NoRenderer: as `Canvas`.
     """
+
+    widening = 1.0
 
     def __init__(
         self,
@@ -199,7 +204,8 @@ class SceneRenderer:
         self._move(qpos)
         mujoco.mjv_updateCamera(self.model, self.data, self._camera, self.scene)
         mujoco.mjv_makeLights(self.model, self.data, self.scene)
-        wider, shape = max(self.height / self.width, 1.0), self.width / self.height
+        wider = self.widening * max(self.height / self.width, 1.0)
+        shape = self.width / self.height
         for view in self.scene.camera:
             view.frustum_bottom *= wider
             view.frustum_top *= wider

@@ -149,14 +149,22 @@ class Panel:
         """Returns by how much marks are larger than usual in a wide field, or smaller in a small scene.
 
         They are made for a picture that shows 3 m across, and are larger beyond 6 m and smaller below 1.6 m.
+        A camera that rests sees all paths, if it has to be widened for that.
         """
         if not self._rests:
             return 1.0
-        self._renderer.look(self._tracks[0].qpos(0.0), self._camera)
+        size = np.array([self._renderer.width, self._renderer.height])
         points = np.vstack([track.points for track in self._tracks])
+        self._renderer.look(self._tracks[0].qpos(0.0), self._camera)
+        middle = size / 2
+        if (np.abs(self._renderer.project(points)[0] - middle) > middle).any():
+            ends = self._renderer.extent(points, np.full(len(points), JUMP_RADIUS))
+            beyond = np.abs(np.array(ends) - middle) / middle
+            # Nothing shows what lies behind the camera.
+            self._renderer.widening = float(beyond[np.isfinite(beyond)].max(initial=1.0))
+            self._renderer.look(self._tracks[0].qpos(0.0), self._camera)
         _, scale = self._renderer.project(points)
-        shown = min(self._renderer.width, self._renderer.height) / scale
-        side = float(np.median(shown))
+        side = float(np.median(size.min() / scale))
         return side / 3.0 if side < 1.6 else max(side / 6.0, 1.0)
 
     def _begin(self, floor: marks.Floor | None) -> None:
