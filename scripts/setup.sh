@@ -23,11 +23,12 @@ apt_install() {
   { $as_root apt-get update -qq && $as_root apt-get install -y -qq "$@"; } >/dev/null 2>&1
 }
 
-# Rendering without a screen takes a GL library that pip does not bring. Without it there is no video,
-# and everything else runs.
-if [ "$(uname)" = Linux ] && ! PATH="$PATH:/usr/sbin:/sbin" ldconfig -p 2>/dev/null | grep -q 'libEGL\.so\.1'; then
-  apt_install libegl1 libgl1-mesa-dri ||
-    echo "There will be no videos: for them, apt-get install libegl1 libgl1-mesa-dri as root."
+# Rendering without a screen takes GL libraries that pip does not bring: EGL, and OpenGL's own functions. Without
+# them there is no video, and everything else runs.
+libraries=$(PATH="$PATH:/usr/sbin:/sbin" ldconfig -p 2>/dev/null || true)
+if [ "$(uname)" = Linux ] && ! [[ $libraries == *libEGL.so.1* && $libraries =~ lib(OpenGL.so.0|GL.so.1) ]]; then
+  gl="libegl1 libopengl0 libgl1-mesa-dri"
+  apt_install $gl || echo "There will be no videos: for them, apt-get install $gl as root."
 fi
 
 venv="${HYRL_MJ_VENV:-.venv}"

@@ -186,7 +186,7 @@ def test_without_gl_one_message_says_what_to_install(backend):
         timeout=60,
     )
     assert f"MUJOCO_GL='{backend}'" in child.stdout
-    assert "apt-get install libegl1 libgl1-mesa-dri" in child.stdout
+    assert "apt-get install libegl1 libopengl0 libgl1-mesa-dri" in child.stdout
     assert child.stdout.count("\n") == 1
     assert "Traceback" not in child.stderr
 
