@@ -14,7 +14,7 @@ from test_export import WHOLE
 from hyrl_mj.errors import BadInput
 from hyrl_mj.judging.game import Lattice
 from hyrl_mj.judging.proof.affine import Affine, Unbounded
-from hyrl_mj.judging.proof.answers import Boxes
+from hyrl_mj.judging.proof.answers import BoundedAnswers, Boxes
 from hyrl_mj.judging.proof.assumptions import check_assumptions
 from hyrl_mj.judging.proof.cells import Cells
 from hyrl_mj.judging.proof.networks import BoundedPolicy
@@ -23,6 +23,7 @@ from hyrl_mj.policies import (
     ACTIVATIONS,
     MlpPolicy,
     Normalization,
+    PolicyController,
     PreprocessedPolicy,
     Preprocessing,
 )
@@ -423,6 +424,21 @@ def test_a_cell_moves_onto_cells_that_hold_whatever_the_plant_does(which, cells,
             assert places == {of.nodes}
         else:
             assert places <= {of.nodes + 1} | set(np.flatnonzero(of.failed).tolist())
+
+
+@pytest.mark.parametrize("which", ["vehicle", "unit_circle"])
+def test_answers_hold_all_cells_that_a_policy_leads_to(which, cells, ring):
+    of, rng = (cells if which == "vehicle" else ring), RNG(6)
+    task = of.lattice.task
+    policy = network(task)
+    answers = BoundedAnswers.enclose(of, PolicyController(policy), task.noise_in_chart(0.1))
+    boxes, (shifts,) = answers.boxes, answers.shifts
+    chosen = {tuple(shift): where for shift, where in shifts}
+    index = rng.integers(boxes.counts, size=(5_000, len(boxes.counts)))
+    u = policy.act(boxes.low + boxes.step * (index + rng.uniform(0, 1, index.shape)))
+    for box, *ends in zip(map(tuple, index), *of.shifts(u, u), strict=True):
+        assert all(chosen[tuple(end)][box] for end in ends)
+    assert len(chosen) > 1
 
 
 def test_cells_fail_where_any_of_their_states_does(cells):
