@@ -431,7 +431,7 @@ def about(path, **changes):
         (
             "policy_kwargs",
             {"activation_fn": "<class 'torch.nn.modules.activation.Softplus'>"},
-            "Softplus.* unknown.*relu, tanh, elu",
+            "Softplus.* is none of relu, tanh, elu",
         ),
     ],
 )
@@ -455,6 +455,13 @@ def test_an_activation_that_cannot_be_is_refused(agent, circle, tmp_path):
     path = saved(untrained(PPO, circle, activation_fn=nn.ReLU), tmp_path)
     with pytest.raises(BadArtifact, match="is 'relu', not 'tanh'"):
         load_agent(path, circle, activation="tanh")
+    partial = "functools.partial(<class 'torch.nn.modules.activation.{}'>, {}"
+    own = {"activation_fn": partial.format("LeakyReLU", "0.3)")}  # another slope
+    with pytest.raises(BadArtifact, match=r"0\.3\) is none of relu, .* with torch's defaults"):
+        load_agent(rewritten(agent, data=json.dumps({"policy_kwargs": own})), circle, "leaky_relu")
+    own = {"activation_fn": partial.format("ReLU", "inplace=True)")}
+    about = {"policy_kwargs": own, "num_timesteps": 0}
+    assert load_agent(rewritten(agent, data=json.dumps(about)), circle).activation == "relu"
     with pytest.raises(BadInput, match="seed -1"):
         load_agent(agent, circle, stochastic=True, seed=-1)
 
@@ -495,9 +502,14 @@ def test_a_function_is_a_policy(circle, vehicle):
     np.testing.assert_array_equal(seen[0], circle.observation(measured).astype(np.float32))
     assert policy.act(measured[:0]).shape == (0, 1)
 
-    steer = from_callable(lambda o: np.where(o[:, 2] > 0, 4, 0), vehicle)
-    u = steer.act(np.array([[0.0, 0.3], [0.0, -0.3]]))
-    np.testing.assert_array_equal(u, [[1.0], [-1.0]])
+    for kind in (int, object):
+        steer = from_callable(
+            lambda o, kind=kind: np.where(o[:, 2] > 0, 4, 0).astype(kind), vehicle
+        )
+        u = steer.act(np.array([[0.0, 0.3], [0.0, -0.3]]))
+        np.testing.assert_array_equal(u, [[1.0], [-1.0]])
+    ruled_out = np.array([[-np.inf, 1.0, 2.0, 0.0, -np.inf]])
+    assert from_callable(lambda o: ruled_out, vehicle).act(np.zeros((1, 2))).item() == 0.0
     arc = hyrl_mj.simulate(vehicle, steer, [0.0, 0.3], horizon=0.5)
     assert arc.z[-1, 1] > 0.3
 
@@ -512,7 +524,13 @@ def test_a_function_is_a_policy(circle, vehicle):
         ),
         ("unit_circle", lambda o: o, r"shape \(4, 2\) for 4 "),
         ("unit_circle", lambda o: o[:1, :1], r"shape \(1, 1\) for 4 "),
-        ("unit_circle", lambda o: None, r"shape \(\)"),
+        ("unit_circle", lambda o: None, r"gives a NoneType of shape \(\)"),
+        ("unit_circle", lambda o: {"action": o}, r"gives a dict of shape \(\)"),
+        ("unit_circle", lambda o: o[:, :1].astype(str), "gives np.str_.*: an input is a number"),
+        ("unit_circle", lambda o: o[:, :1].astype("m8[s]"), "timedelta.*: an input is a number"),
+        ("unit_circle", lambda o: np.ma.array(o[:, :1], mask=True), "masks some of its numbers"),
+        ("vehicle", lambda o: np.ma.array(np.eye(5)[:4], mask=np.eye(5)[:4]), "masks some of its"),
+        ("vehicle", lambda o: np.full((len(o), 5), -np.inf), "preference is not a finite number"),
         ("unit_circle", lambda o: o[:, :1] * np.nan, "gives nan"),
         ("unit_circle", lambda o: np.full((len(o), 1), "left"), "'left'.*: an input is a number"),
         ("unit_circle", lambda o: 1 / 0, "raised ZeroDivisionError: division by zero"),

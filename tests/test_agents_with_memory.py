@@ -339,6 +339,53 @@ def test_a_model_of_sb3_contrib_acts_as_there(circle):
         np.testing.assert_allclose(arc.u[:-1], theirs, atol=1e-5)
 
 
+def test_a_model_begins_as_it_does_without_a_state(circle):
+    """Not with zeros, where it begins otherwise and heeds no `episode_start`."""
+
+    class Eager:
+        def predict(self, observation, state=None, episode_start=None, deterministic=False):
+            before = np.full((1, len(observation), 1), 0.5) if state is None else state[0]
+            mean = 0.9 * before + 0.1 * observation[None, :, 1:]
+            return mean[0], (mean,)
+
+    policy = read_agent(circle, Eager()).policy
+    for arc in simulate(circle, policy, [[1.0], [4.0]], horizon=0.5):
+        state = None
+        for u, seen in zip(arc.u, circle.observation(arc.measured[:-1]), strict=False):
+            action, state = Eager().predict(seen[None], state)
+            np.testing.assert_allclose(u, action[0], atol=1e-6)
+    memory, (u, after) = (
+        policy.start(2),
+        policy.act_after(policy.start(2), np.array([[1.0], [4.0]])),
+    )
+    memory[1] = after[1]  # one run begins, and the other goes on
+    mixed = policy.act_after(memory, np.array([[1.0], [4.0]]))[0]
+    np.testing.assert_allclose(mixed, [u[0], [0.9 * u[1, 0] + 0.1 * np.sin(4.0)]], atol=1e-6)
+
+
+def test_which_of_two_methods_acts_is_asked(circle):
+    class Both:
+        def __call__(self, observation):
+            return turn(observation)
+
+        def predict(self, observation, state=None, episode_start=None, deterministic=False):
+            return 0.5 * turn(observation), None
+
+    with pytest.raises(
+        BadInput, match=r"can be called, and has predict\(\) as well.*agent\.predict"
+    ):
+        from_callable(Both(), circle)
+    with pytest.raises(BadInput, match="Both is a class: give an object of it"):
+        from_callable(Both, circle)
+
+    class Acts:
+        def act(self, state):
+            return turn(np.atleast_2d(state))
+
+    with pytest.raises(BadInput, match=r"act\(state\) of .* takes observations, it seems"):
+        read_agent(circle, Acts())
+
+
 def test_a_model_without_a_state_is_a_function(circle):
     class Plain:
         def predict(self, observation, state=None, episode_start=None, deterministic=False):

@@ -144,7 +144,7 @@ def jumping(self, now):
             lambda self, now: np.full(len(now.rows), 0.1),
             r"float64 of shape \(60,\), where \(60, 2\)",
         ),
-        (lambda self, now: None, r"object of shape \(\)"),
+        (lambda self, now: None, r"gives a NoneType of shape \(\)"),
         (lambda self, now: np.zeros(now.measurement.shape, int), "gives int64 of shape"),
         (lambda self, now: now.measurement * np.nan, "noise is nan at sample 0 of simulation 0"),
         (lambda self, now: np.where(now.k[:, None] > 9, 1.0, [0, 0.1]), "is 1 at sample 10 of"),
@@ -185,6 +185,56 @@ def test_a_kind_that_does_not_keep_its_bound_is_refused(init, message, vehicle, 
     monkeypatch.setitem(_KINDS, "given", kind_of(gaussian, __init__=init))
     with pytest.raises(BadInput, match=message):
         Noise("given", 0.1).against(vehicle, None)
+
+
+def remembers_anew(self, now):
+    self.made.append(1)
+    return np.full(now.measurement.shape, self.bound * np.sin(len(self.made))) * self.shares
+
+
+def draws_anew(self, now):
+    return self.made.uniform(-self.bound, self.bound, now.measurement.shape) * self.shares
+
+
+@pytest.mark.parametrize(
+    ("sample", "made"), [(remembers_anew, list), (draws_anew, np.random.default_rng)]
+)
+def test_what_reset_does_not_begin_anew_is_refused(sample, made, vehicle, monkeypatch):
+    """Else the second loop of a seed would have other noise than the first."""
+
+    def init(self, bound, shares):
+        Signal.__init__(self, bound, shares)
+        self.made = made()
+
+    kind = kind_of(sample, __init__=init)
+    monkeypatch.setitem(_KINDS, "given", kind)
+    loop, z0 = PolicyController(sign_policy(vehicle)), np.array([[0.0, 0.5]])
+    for noise in (Noise("given", 0.1), kind(0.1, np.array([0.0, 1.0]))):
+        with pytest.raises(BadInput, match="other values where it begins anew with the same seed"):
+            closed_loop(vehicle, loop, z0, noise)
+        with pytest.raises(BadInput, match="other values where it begins anew with the same seed"):
+            gym.make(vehicle.env_id, noise=noise)
+
+
+def test_what_a_signal_lacks_is_a_sentence(vehicle):
+    loop, z0 = PolicyController(sign_policy(vehicle)), np.array([[0.0, 0.5]])
+    for shares, bound in (([1.0], 0.1), ([0.0, 1.0], np.nan), ([0.0, 1.0], -0.1)):
+        signal = kind_of(gaussian)(bound, np.array(shares))
+        with pytest.raises(BadInput, match=r"a share for each of the columns .* vehicle has 2"):
+            closed_loop(vehicle, loop, z0, signal)
+    broken = kind_of(gaussian, reset=lambda self, n, rng: 1 / 0)(0.1, np.array([0.0, 1.0]))
+    with pytest.raises(BadInput, match=r"its reset\(\) raised ZeroDivisionError"):
+        closed_loop(vehicle, loop, z0, broken)
+    for kind in ("two words", "", "a+b", 5, Signal.kind):
+        with pytest.raises(BadInput, match="give it a kind of one word"):
+            register_noise(type("Given", (Signal,), {"kind": kind}))
+
+
+def test_a_record_keeps_what_it_was_given():
+    values = np.full((2, 1, 2), 0.1)
+    record = Recorded(values, 0.1)
+    values[:] = -0.1
+    assert (record.values == 0.1).all()
 
 
 def test_a_recorded_signal_of_other_runs_is_refused():

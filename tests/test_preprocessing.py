@@ -72,9 +72,13 @@ class Executes:
         return os.system, ("touch executed",)
 
 
-def pickled_statistics(tmp_path, **options):
+class OwnNormalize(VecNormalize):
+    """A user's class, which may normalise otherwise."""
+
+
+def pickled_statistics(tmp_path, kind=VecNormalize, **options):
     """What `VecNormalize.save` writes after some samples, and the object."""
-    env = VecNormalize(TaskVecEnv(BatchedEnv(hyrl_mj.get_task("unit_circle"), 1)), **options)
+    env = kind(TaskVecEnv(BatchedEnv(hyrl_mj.get_task("unit_circle"), 1)), **options)
     env.reset()
     for _ in range(20):
         env.step(np.array([env.action_space.sample()]))
@@ -83,7 +87,7 @@ def pickled_statistics(tmp_path, **options):
 
 
 def test_statistics_are_read_as_sb3_saves_them(tmp_path):
-    path, env = pickled_statistics(tmp_path, clip_obs=3.0, epsilon=1e-4)
+    path, env = pickled_statistics(tmp_path, clip_obs=np.float64(3.0), epsilon=1e-4)
     found, seen = Normalization.load(path), np.random.default_rng(0).normal(size=(50, 2))
     np.testing.assert_array_equal(found(seen).astype(np.float32), env.normalize_obs(seen))
     assert (found.clip, found.epsilon) == (3.0, 1e-4)
@@ -109,7 +113,7 @@ def test_statistics_of_a_dict_are_read_by_its_keys(tmp_path):
     np.testing.assert_array_equal(found.mean, np.concatenate(means))
 
 
-@pytest.mark.parametrize("what", ["no statistics", "code", "nested", "cut off", "plain"])
+@pytest.mark.parametrize("what", ["no statistics", "code", "nested", "cut off", "plain", "own"])
 def test_pickles_that_are_no_statistics_are_refused(what, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     path, _ = pickled_statistics(tmp_path, norm_obs=what != "plain")
@@ -121,7 +125,12 @@ def test_pickles_that_are_no_statistics_are_refused(what, tmp_path, monkeypatch)
         path.write_bytes(pickle.dumps({"obs_rms": 3}))
     if what == "nested":  # keys that double
         path.write_bytes(b"\x80\x04}(" + b")" + b"2\x86" * 5_000 + b"K\x01u.")
-    told = "did not normalise" if what == "plain" else "no VecNormalize that SB3 has saved"
+    if what == "own":
+        path, _ = pickled_statistics(tmp_path, OwnNormalize)
+    told = {
+        "plain": "did not normalise",
+        "own": r"is a \S+\.OwnNormalize, which may normalise otherwise",
+    }.get(what, "no VecNormalize that SB3 has saved")
     with pytest.raises(BadArtifact, match=told):
         Normalization.load(path)
     assert not (tmp_path / "executed").exists()
@@ -381,8 +390,13 @@ def test_a_module_that_ends_in_tanh_is_refused_where_inputs_have_other_limits(ci
     assert hyrl_mj.from_callable(network, circle).act(np.ones((2, 1))).shape == (2, 1)
     with pytest.raises(BadInput, match=r"ends in Tanh, .* let it scale them"):
         hyrl_mj.from_callable(network, Lopsided())
+    for other in (torch.jit.trace(network, torch.zeros(1, 2)), torch.jit.script(network)):
+        with pytest.raises(BadInput, match=r"ends in Tanh, .* let it scale them"):
+            hyrl_mj.from_callable(other, Lopsided())
     network.append(torch.nn.Hardtanh(-3, 3))
     hyrl_mj.from_callable(network, Lopsided())
+    half = network.to(torch.bfloat16)  # which NumPy does not have
+    assert hyrl_mj.from_callable(half, circle).act(np.ones((2, 1))).shape == (2, 1)
 
 
 class Pair(torch.nn.Module):

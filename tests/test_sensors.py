@@ -26,7 +26,7 @@ from hyrl_mj.simulation import (
     register_noise,
     usual_kinds,
 )
-from hyrl_mj.simulation.noise import noise_class
+from hyrl_mj.simulation.noise import _KINDS, noise_class
 from hyrl_mj.simulation.sensors import Part
 from hyrl_mj.viz import beginning
 from hyrl_mj.viz.tables import robustness_sentence, sensed_table
@@ -244,6 +244,16 @@ def test_a_late_sensor_needs_a_measurement_that_begins_with_the_chart():
     swapped.z = lambda measured: measured[:, ::-1]
     with pytest.raises(BadInput, match="let the measurement begin with them"):
         Sensor.parse("uniform 0.01 + delay 2").against(swapped, None)
+
+
+def test_an_option_that_a_kind_cannot_take_is_refused(monkeypatch):
+    kind = type(
+        "Fixed", (noise_class("uniform"),), {"kind": "fixed", "sigma": property(lambda s: 1)}
+    )
+    monkeypatch.setitem(_KINDS, "fixed", kind)
+    assert Sensor.parse("fixed 0.1").bound == 0.1
+    with pytest.raises(BadInput, match="fixed has no sigma"):
+        Sensor.parse("fixed 0.1 sigma 0.05")
 
 
 def test_noise_that_cannot_be_copied_acts_in_an_environment():

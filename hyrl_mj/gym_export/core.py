@@ -11,7 +11,15 @@ from numpy.typing import ArrayLike
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.ranges import Integer, Optional
-from hyrl_mj.simulation import NOT_STARTED, AnyNoise, Sample, drawn, signal_for, try_signal
+from hyrl_mj.simulation import (
+    NOT_STARTED,
+    AnyNoise,
+    Sample,
+    begin_signal,
+    drawn,
+    signal_for,
+    try_signal,
+)
 from hyrl_mj.tasks import Outcome, Task, at_levels, check_finite
 
 # The most episodes side by side.
@@ -125,7 +133,7 @@ class BatchedEnv:
         """
         seed = Optional(Integer(0, 2**64)).checked("seed", seed)
         self._rng = np.random.default_rng(seed)
-        self._noise.reset(self.n, self._rng)
+        begin_signal(self._noise, self.n, self._rng)
 
     def reset(self, ids: np.ndarray | None = None, z: np.ndarray | None = None) -> np.ndarray:
         """Starts new episodes in the rows `ids` (k,), by default all; returns observations (k, o) float32.

@@ -42,7 +42,13 @@ class FunctionPolicy(ObservationPolicy):
                     "it returns a tuple, as the predict() of SB3 does: give its first part, as lambda o: "
                     "model.predict(o)[0]"
                 )
+            if np.ma.is_masked(answer):
+                raise BadInput(
+                    "it masks some of its numbers: fill them in, as preferences with -inf"
+                )
             actions = np.asarray(answer)
+            if actions.dtype == object:
+                actions = np.array(actions.tolist())
             if discrete and actions.ndim > 1 and actions.dtype.kind == "f":
                 actions = _preferred(actions, self.task)
         except Exception as error:  # a user's code can raise anything
@@ -50,18 +56,16 @@ class FunctionPolicy(ObservationPolicy):
             raise BadInput(f"{self.name} cannot be used: {what}") from error
         shape, what = ((n,), "integers") if discrete else ((n, m), "inputs")
         if actions.shape != shape:
+            of = "" if actions.ndim else f"a {type(answer).__name__} of "
             raise BadInput(
-                f"{self.name} gives shape {actions.shape} for {n} observations, {self.task.name} takes "
+                f"{self.name} gives {of}shape {actions.shape} for {n} observations, {self.task.name} takes "
                 f"{what} of shape {shape}"
             )
         if discrete:
             return at_levels(self.task, actions)
-        try:
-            if actions.dtype.kind == "c":
-                raise TypeError
-            actions = actions.astype(float)
-        except (TypeError, ValueError):
-            raise BadInput(f"{self.name} gives {actions.flat[0]!r}: an input is a number") from None
+        if actions.dtype.kind not in "biuf":
+            raise BadInput(f"{self.name} gives {actions.flat[0]!r}: an input is a number")
+        actions = actions.astype(float)
         finite = np.isfinite(actions)
         if not finite.all():
             raise BadInput(
@@ -193,16 +197,27 @@ class _Predicting:
         return memory
 
     def act(self, memory: np.ndarray, observation: np.ndarray) -> tuple[Any, np.ndarray]:
-        n, ends = len(memory), np.cumsum([part.size for part in self.state])[:-1]
-        state = tuple(
-            np.moveaxis(flat.reshape(n, *part[:, 0].shape), 0, 1).astype(part.dtype)
-            for flat, part in zip(np.split(memory[:, 1:], ends, axis=1), self.state, strict=True)
+        begins, given, after = memory[:, 0] == 1, [], []
+        groups = [rows for rows in map(np.flatnonzero, (begins, ~begins)) if len(rows)]
+        for rows in groups:
+            # A run begins with the state None, as under SB3, which may stand for others than zeros.
+            state = None if begins[rows[0]] else self._state(memory[rows, 1:])
+            actions, state = self.model.predict(
+                self.seen(observation[rows]), state, begins[rows], deterministic=True
+            )
+            flat = [np.moveaxis(part, 1, 0).reshape(len(rows), -1) for part in state]
+            given.append(np.asarray(actions))
+            after.append(np.hstack([np.zeros((len(rows), 1)), *flat]))
+        order = np.argsort(np.concatenate(groups))
+        return np.concatenate(given)[order], np.concatenate(after)[order]
+
+    def _state(self, memory: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Returns the state of the model in the memory (n, size) of runs that have begun."""
+        ends = np.cumsum([part.size for part in self.state])[:-1]
+        return tuple(
+            np.moveaxis(flat.reshape(len(memory), *part[:, 0].shape), 0, 1).astype(part.dtype)
+            for flat, part in zip(np.split(memory, ends, axis=1), self.state, strict=True)
         )
-        actions, state = self.model.predict(
-            self.seen(observation), state=state, episode_start=memory[:, 0] == 1, deterministic=True
-        )
-        flat = [np.moveaxis(part, 1, 0).reshape(n, -1) for part in state]
-        return actions, np.hstack([np.zeros((n, 1)), *flat])
 
 
 def _predicting(model: Predicts, task: Task) -> FunctionPolicy | RememberingPolicy:
@@ -267,8 +282,8 @@ def _check_model(model: Any, task: Task) -> None:
     levels = task.input_levels
     if actions is None:
         return
-    shape, n = (getattr(actions, name, None) for name in ("shape", "n"))
-    if levels is not None and (shape, n) != ((), len(levels)):
+    shape, n, first = (getattr(actions, name, None) for name in ("shape", "n", "start"))
+    if levels is not None and ((shape, n) != ((), len(levels)) or first not in (0, None)):
         raise BadInput(
             f"the model's actions are {actions}, and {task.name} takes one of {len(levels)} levels: train it "
             "on them, or give a function that chooses among them"
@@ -293,11 +308,11 @@ def _arguments(function: Any) -> Set[str]:
 
 def check_act(policy: Policy) -> None:
     """Raises `BadInput` if `act` of a user's policy tells by its argument that it takes observations."""
-    first = next(iter(_arguments(policy.act)), "")
-    if first.startswith("obs"):
+    first = next(iter(_arguments(policy.act)), "measured")
+    if not first.startswith("meas"):
         raise BadInput(
-            f"act({first}) of {policy!r:.60} takes observations, and a policy is asked about measurements, "
-            "act(measured): give hyrl_mj.from_callable(agent.act, task)"
+            f"act({first}) of {policy!r:.60} takes observations, it seems, and a policy is asked about "
+            "measurements: give hyrl_mj.from_callable(agent.act, task), or call the argument measured"
         )
 
 
@@ -325,6 +340,8 @@ def from_callable(function: PythonAgent, task: Task) -> FunctionPolicy | Remembe
             returns another shape, a number that is not finite, an integer out of range, or no such memory.
     """
     task = get_task(task)
+    if isinstance(function, type):
+        raise BadInput(f"{function.__name__} is a class: give an object of it")
     if declares_memory(function):
         policy = RememberingPolicy(task, cast(AgentWithMemory, function))
         policy.start(1)
@@ -336,8 +353,14 @@ def from_callable(function: PythonAgent, task: Task) -> FunctionPolicy | Remembe
             return _predicting(cast(Predicts, function), task)
         if _last_part(function) == "Tanh":
             check_scaled(task, "the module")
-        return FunctionPolicy(task, _of_arrays(function), "the module")
     if callable(function):
+        if others := [n for n in ("predict", "act") if callable(getattr(function, n, None))]:
+            raise BadInput(
+                f"{type(function).__name__} can be called, and has {others[0]}() as well, which may answer "
+                f"otherwise: give a function that calls the one that acts, as lambda o: agent.{others[0]}(o)"
+            )
+        if _is_module(function):
+            return FunctionPolicy(task, _of_arrays(function), "the module")
         return FunctionPolicy(task, function)
     if callable(getattr(function, "predict", None)):
         return _predicting(cast(Predicts, function), task)
@@ -355,9 +378,14 @@ def _is_module(function: object) -> bool:
 
 def _last_part(module: Any) -> str:
     """Returns the name of the last part of a `torch.nn.Sequential`, or of another module itself."""
-    while type(module).__name__ == "Sequential" and len(module):
-        module = module[-1]
-    return type(module).__name__
+    while True:
+        module = getattr(module, "_orig_mod", module)  # of one that torch has compiled
+        # One that torch has scripted or traced says what it was.
+        name = str(getattr(module, "original_name", type(module).__name__))
+        parts = list(module.children())
+        if name != "Sequential" or not parts:
+            return name
+        module = parts[-1]
 
 
 def check_scaled(task: Task, name: str) -> None:
@@ -381,6 +409,8 @@ def _of_arrays(module: Any) -> Callable[[np.ndarray], np.ndarray]:
             answer = module(torch.from_numpy(observation).to(weight.device, weight.dtype))
         if not isinstance(answer, torch.Tensor):
             raise BadInput(f"it gives {type(answer).__name__}, not a tensor")
+        # NumPy has no bfloat16.
+        answer = answer.double() if answer.is_floating_point() else answer
         actions: np.ndarray = answer.cpu().numpy()
         return actions
 
@@ -396,6 +426,6 @@ def _preferred(preferences: np.ndarray, task: Task) -> np.ndarray:
             f"{task.name} takes preferences of shape (n, {levels}) or integers (n,), got "
             f"{preferences.dtype} of shape {preferences.shape}"
         )
-    if not np.isfinite(preferences).all():
+    if not np.isfinite(preferences.max(axis=1)).all():  # -inf is of a level that is ruled out
         raise BadInput("a preference is not a finite number")
     return preferences.argmax(axis=1)

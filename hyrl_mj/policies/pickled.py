@@ -176,9 +176,15 @@ def statistics(content: bytes) -> dict[str, np.ndarray]:
         raise BadArtifact(
             f"it has {len(content):,} bytes, and statistics take less than {LARGEST:,}: give those of vectors"
         )
-    found = {}
+    found, kind = {}, ""
     with suppress(Exception):  # a damaged pickle may raise any error
-        found = entries(read(content))
+        read_in = read(content)
+        found, kind = entries(read_in), read_in.function
+    if found and not kind.startswith(("stable_baselines3.", *DICTS)):
+        raise BadArtifact(
+            f"it is a {kind:.80}, which may normalise otherwise than SB3's VecNormalize: give a function "
+            "that does as it did, or, if it does the same, an npz file with mean, var and clip"
+        )
     if found.get("norm_obs") is False:
         raise BadArtifact(
             "its VecNormalize did not normalise observations: give none in place of the file"
@@ -207,6 +213,8 @@ def _array(found: Any) -> np.ndarray | None:
         return None
     if function == "_frombuffer":  # NumPy's pickles of protocol 5
         data, kind, shape, order = found.arguments
+    elif function == "scalar":
+        (kind, data), shape, order = found.arguments, (), "C"
     elif function == "_reconstruct":
         _, shape, kind, fortran, data = found.state
         order = "F" if fortran else "C"

@@ -226,7 +226,7 @@ def infer_algorithm(weights: Mapping[str, np.ndarray], about: Mapping[str, Any])
         return "td3" if any(name.startswith("critic.qf1.") for name in weights) else "ddpg"
     first = _short(", ".join(list(weights)[:3])) or "none"
     raise BadArtifact(
-        f"its tensors ({first}) are of no MLP policy of {', '.join(ALGORITHMS)}: {REMEDY}"
+        f"its tensors ({first}) are of no MLP policy of {', '.join(ALGORITHMS)}: {INSTEAD}"
     )
 
 
@@ -234,7 +234,12 @@ def _activation(about: Mapping[str, Any], chosen: str | None) -> str | None:
     """Returns the activation that the metadata names, else the chosen one."""
     named = _entry(about, "policy_kwargs", "activation_fn")
     classes = {f"<class 'torch.nn.modules.activation.{TORCH_NAMES[n]}'>": n for n in ACTIVATIONS}
-    name = classes.get(named)
+    # What is done in place gives the same numbers.
+    name = classes.get(re.sub(r"functools\.partial\((.*), inplace=\w+\)", r"\1", named))
+    if named and not name and "torch.nn." in named:
+        raise BadArtifact(
+            f"its activation {named} is none of {', '.join(ACTIVATIONS)} with torch's defaults: {INSTEAD}"
+        )
     if named and not name and chosen is None:
         raise BadArtifact(
             f"its activation {named} is unknown: if it is one of {', '.join(ACTIVATIONS)}, give that as "

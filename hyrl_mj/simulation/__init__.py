@@ -5,7 +5,7 @@ noise is a class of its own, a `Signal`, that `register_noise` registers by its 
 """
 
 from hyrl_mj.simulation.arc import LONGEST, HybridArc, samples, simulate, simulate_batch
-from hyrl_mj.simulation.checked_noise import drawn
+from hyrl_mj.simulation.checked_noise import begin_signal, drawn
 from hyrl_mj.simulation.lookahead import Ahead, Lookahead
 from hyrl_mj.simulation.noise import (
     KINDS,
@@ -57,6 +57,7 @@ __all__ = [
     "Sensor",
     "Signal",
     "WayRuns",
+    "begin_signal",
     "closed_loop",
     "covers_sensor",
     "drawn",

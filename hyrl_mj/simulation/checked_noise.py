@@ -48,8 +48,9 @@ def drawn(signal: Signal, now: Sample) -> np.ndarray:
     true, limits = now.measurement, limits_of(signal)
     if not isinstance(noise, np.ndarray) or noise.shape != true.shape or noise.dtype.kind != "f":
         given = np.asarray(noise)
+        kind = given.dtype if isinstance(noise, np.ndarray) else f"a {type(noise).__name__}"
         raise BadInput(
-            f"{signal.kind} noise gives {given.dtype} of shape {given.shape}, where {true.shape} floats are "
+            f"{signal.kind} noise gives {kind} of shape {given.shape}, where {true.shape} floats are "
             "needed: a row for each simulation, a column for each of the measurement"
         )
     begun = getattr(signal, "_begun", limits)
@@ -76,6 +77,24 @@ def twin_of(signal: Signal, *kept: object) -> Signal | None:
     with suppress(Exception):  # a user's object can raise anything
         return None if is_own(signal) else deepcopy(signal, {id(one): one for one in kept})
     return None
+
+
+def begin_signal(signal: Signal, n: int, seed: int | np.random.Generator) -> None:
+    """Resets a signal for n simulations; raises `BadInput` if a user's raises an error."""
+    try:
+        signal.reset(n, np.random.default_rng(seed))
+    except BadInput:
+        raise
+    except Exception as error:  # a user's code can raise anything
+        raise BadInput(
+            f"{signal.kind} noise cannot be used: its reset() raised {brief(error)}"
+        ) from error
+
+
+def play_and_begin(twin: Signal, now: Sample, n: int, seed: int) -> None:
+    """Lets a twin play a sample and begin anew, as a signal does that has played before."""
+    drawn(twin, now)
+    begin_signal(twin, n, seed)
 
 
 def check_repeats(signal: Signal, noise: np.ndarray, twin: Signal, now: Sample) -> None:

@@ -16,9 +16,11 @@ import numpy as np
 
 from hyrl_mj.errors import BadInput, check_bound, unknown
 from hyrl_mj.simulation.checked_noise import (
+    begin_signal,
     check_repeats,
     drawn,
     limits_of,
+    play_and_begin,
     too_large,
     twin_of,
     within,
@@ -80,7 +82,7 @@ class Signal(ABC):
         rng: the generator that random noise is drawn from, after `reset`.
     """
 
-    kind: str
+    kind = "unnamed"
     needs_controller = False
     unseeing = False
     # Signals that it is made of.
@@ -131,6 +133,12 @@ def register_noise(signal: type[AnySignal]) -> type[AnySignal]:
     Raises:
         BadInput: another class has that kind.
     """
+    words = signal.kind.split() if isinstance(signal.kind, str) else []
+    if words != [signal.kind] or "+" in signal.kind or signal.kind == Signal.kind:
+        raise BadInput(
+            f"{signal.__name__} cannot be registered as {signal.kind!r}: give it a kind of one word, as "
+            'kind = "walk"'
+        )
     if signal.kind in RESERVED:
         raise BadInput(
             f"{signal.__name__} cannot be registered: {signal.kind!r} means something else where noise is "
@@ -254,9 +262,12 @@ class Recorded(Signal):
             )
         columns = values.shape[2]
         shares = np.ones(columns) if self.shares is None else np.asarray(self.shares, dtype=float)
-        if shares.shape != (columns,):
-            raise BadInput(f"a recorded noise on {columns} columns has shares of {shares.shape}")
-        self.values, self.shares = values.astype(float, copy=False), shares
+        if shares.shape != (columns,) or not np.isfinite(shares).all():
+            raise BadInput(
+                f"a recorded noise on {columns} columns has shares {shares}: give a number for each"
+            )
+        # Copies, because the arrays are their owner's, who may fill them anew.
+        self.values, self.shares = values.astype(float), shares.copy()
         bad = ~within(values if single else self.values, self.limits)
         if bad.any():
             k, row, column = np.argwhere(bad)[0]
@@ -352,7 +363,13 @@ def signal_for(noise: AnyNoise | None, task: Task, controller: Controller | None
         )
     signal = noise.against(task, controller)
     for one in (signal, *signal.noises):
-        object.__setattr__(one, "_begun", limits_of(one).copy())  # a user's may be frozen
+        limits, p = limits_of(one), len(task.noisy)
+        if limits.shape != (p,) or not ((limits >= 0) & np.isfinite(limits)).all():
+            raise BadInput(
+                f"{one.kind} noise has {limits} as its largest magnitudes: give it a bound >= 0, and a share "
+                f"for each of the columns of the measurement, of which {task.name} has {p}"
+            )
+        object.__setattr__(one, "_begun", limits.copy())  # a user's may be frozen
     return signal
 
 
@@ -365,9 +382,12 @@ def try_signal(signal: Signal, task: Task, n: int) -> None:
     if len(twins) < 2:
         return
     for twin in twins:
-        twin.reset(n, np.random.default_rng(0))
+        begin_signal(twin, n, 0)
     plant = task.placed(task.starts(n, np.random.default_rng(0)), np.random.default_rng(0))
     for k in range(8):
         samples, modes = np.full(n, k), np.full(n, NOT_STARTED)
         now = Sample(np.arange(n), samples, plant.measurement, modes, plant)
-        check_repeats(twins[0], drawn(twins[0], now), twins[1], now)
+        noise = drawn(twins[0], now)
+        if k == 0:
+            play_and_begin(twins[1], now, n, 0)
+        check_repeats(twins[0], noise, twins[1], now)

@@ -9,7 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hyrl_mj.policies import Asked, Controller, memory_at_start
-from hyrl_mj.simulation.checked_noise import check_repeats, drawn, twin_of
+from hyrl_mj.simulation.checked_noise import (
+    begin_signal,
+    check_repeats,
+    drawn,
+    play_and_begin,
+    twin_of,
+)
 from hyrl_mj.simulation.noise import (
     NOT_STARTED,
     AnyNoise,
@@ -127,7 +133,7 @@ def closed_loop(
     twin = twin_of(signal, task, controller)
     for one in (signal, twin):
         if one is not None:
-            one.reset(n, np.random.default_rng(seed))
+            begin_signal(one, n, seed)
     ahead: list[np.ndarray] | None = [] if signal.unseeing and not together else None
     ask, measurement = Asked(task, controller), plant.measurement
     # A run backward has no past that could be remembered.
@@ -155,6 +161,8 @@ def closed_loop(
         errors = _noise(signal, now, ahead, measurement)
         # Noise of a user's class is drawn twice at first, to see whether its seed decides it.
         if twin is not None and ahead is None and tick < 8:
+            if tick == 0:
+                play_and_begin(twin, now, n, seed)
             check_repeats(signal, errors, twin, now)
         measured = plant.observe(now.measurement, errors, rows)
         if plant.late:  # what the last step came to is known only now

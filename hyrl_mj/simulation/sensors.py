@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, ClassVar, Self
 import numpy as np
 
 from hyrl_mj.errors import LARGEST_NUMBER, BadInput, check_bound, unknown
-from hyrl_mj.simulation.checked_noise import drawn
+from hyrl_mj.simulation.checked_noise import begin_signal, drawn
 from hyrl_mj.simulation.noise import (
     DELAY,
     HOLD,
@@ -188,7 +188,10 @@ class Part:
             raise unknown("part of a sensor", word, words)
         allowed = ["rate"] if word == HOLD else []
         if word in noise_kinds():
-            allowed = [name for name in ("sigma", "rate") if hasattr(noise_class(word), name)]
+            kind, none = noise_class(word), property()  # which no signal can be given
+            allowed = [
+                n for n in ("sigma", "rate") if not isinstance(getattr(kind, n, none), property)
+            ]
         said = f"{text.strip()!r} is no part of a sensor"
         what = " ".join([word, "N", *(f"[{name} X]" for name in allowed)])
         names, values = rest[1::2], rest[2::2]
@@ -413,7 +416,7 @@ class Sensed(Signal):
     def reset(self, n: int, rng: np.random.Generator) -> None:
         super().reset(n, rng)
         for noise in self.noises:
-            noise.reset(n, rng)
+            begin_signal(noise, n, rng)
         columns = len(self.shares)
         self._sent = np.zeros((n, 1 + self._delays[1], columns))  # the last one last
         self._told, self._row = np.zeros((n, columns)), np.zeros(n, int)
