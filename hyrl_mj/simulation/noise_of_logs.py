@@ -266,8 +266,8 @@ def _clock(
         i = int(np.argmin(steps > 0))  # the names are line 1
         raise BadInput(
             f"{path}, line {i + 3}: the time does not increase, from {t[i]:.10g} to {t[i + 1]:.10g}: sort "
-            "the rows by it, leave out what has the same, and of a clock that was set back give the rows before "
-            "or after that"
+            "the rows by it, leave out what has the same, and of a clock that was set back give the rows "
+            "before or after that"
         )
     step, remarks = _check_step(float(np.median(steps))), []
     samples = np.rint(steps / step)
