@@ -176,6 +176,22 @@ def test_in_a_closed_loop_it_acts_as_under_sb3(algorithm, name, wrapped, tmp_pat
             np.testing.assert_allclose(arc.u[:-1], theirs, atol=2e-5)
 
 
+def test_statistics_of_what_a_wrapper_made_are_refused(circle, tmp_path):
+    inside = gym.wrappers.NormalizeObservation(gym.make(circle.env_id))
+    for inner in (TaskVecEnv(BatchedEnv(circle, 1)), DummyVecEnv([lambda: inside])):
+        env = VecNormalize(inner)
+        model = PPO("MlpPolicy", env, n_steps=8, batch_size=8, device="cpu", seed=0).learn(8)
+        model.save(tmp_path / "agent.zip")
+        env.save(tmp_path / "stats.pkl")
+        needs = {"vecnormalize": tmp_path / "stats.pkl"}
+        if isinstance(inner, TaskVecEnv):
+            load_agent(tmp_path / "agent.zip", circle, **needs)
+    with pytest.raises(
+        BadArtifact, match=r"under a wrapper .* before the given statistics come in"
+    ):
+        load_agent(tmp_path / "agent.zip", circle, **needs)
+
+
 def test_its_steady_answer_is_that_to_an_unchanged_measurement(vehicle, tmp_path):
     _, path, needs = agent(DQN, vehicle, tmp_path, WRAPPED["normalised, stacked"])
     policy = load_agent(path, vehicle, **needs)

@@ -105,6 +105,15 @@ def check_observations(about: Mapping[str, Any], task: Task, on_policy: bool, n_
         )
 
 
+def check_original(about: Mapping[str, Any], task: Task) -> None:
+    """Raises `BadArtifact` if what `VecNormalize` normalised were no observations of a task."""
+    original = _observations(_decoded(about.get("_last_original_obs")), task)
+    if sign := _wrapped((None, None), None, original, _Possible(task)):
+        raise BadArtifact(
+            f"{sign}, before the given statistics come in; give a function that does in Python as both did"
+        )
+
+
 def check_model(model: Any, task: Task) -> None:
     """Raises `BadInput` unless a model of SB3, if it is one, was trained on plain observations."""
     normalizer = getattr(model, "get_vec_normalize_env", lambda: None)()

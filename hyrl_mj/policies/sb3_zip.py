@@ -64,7 +64,9 @@ def from_zip(
         activation = _activation(about, activation) or known.activation
         policy = MlpPolicy(task, algorithm, activation, weights, preprocessing.n_stack)
         sb3_metadata.check_inputs(about, task)
-        if preprocessing.normalization is None and not plain:
+        if preprocessing.normalization is not None:
+            sb3_metadata.check_original(about, task)
+        elif not plain:
             n_stack = preprocessing.n_stack
             sb3_metadata.check_observations(about, task, known.is_actor_critic, n_stack)
     return policy, preprocessing
