@@ -619,8 +619,10 @@ def test_python_code_is_named_by_its_module_and_object(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "my_agents.py").write_text(
         "class Group:\n    @staticmethod\n    def steer(o):\n        return o[:, :1]\n\n\nthree = 3\n"
+        "import os\n\nos.chdir('/')\n"
     )
     found = agent_at(Path("my_agents:Group.steer"))
+    assert Path.cwd() == tmp_path, "where a run is written to"
     assert found(np.ones((2, 3))).tolist() == [[1], [1]]
     (tmp_path / "my_agents:Group.steer").touch()  # a file comes first
     assert agent_at(Path("my_agents:Group.steer")) == Path("my_agents:Group.steer")

@@ -54,19 +54,21 @@ def is_received() -> bool:
 def current_folder(name: str) -> Iterator[None]:
     """Lets a module that the user names, as "package.module:Name", be imported from the current folder.
 
-    What is installed comes first: where the module is, the current folder is not searched at all.
+    What is installed comes first: where the module is, the current folder is not searched at all. That stays
+    the current folder, whose paths are meant elsewhere, also where the module changes to another one.
     """
-    if _installed(name) is not None:
-        yield
-        return
-    if (file := module_file(name)) is not None:
-        compile_each_time(file)
-    sys.path.append("")
+    here, searched = os.getcwd(), _installed(name) is None
+    if searched:
+        if (file := module_file(name)) is not None:
+            compile_each_time(file)
+        sys.path.append("")
     try:
         yield
     finally:
-        last = max(i for i, folder in enumerate(sys.path) if folder == "")
-        del sys.path[last]  # not one of the user's own
+        os.chdir(here)
+        if searched:
+            last = max(i for i, folder in enumerate(sys.path) if folder == "")
+            del sys.path[last]  # not one of the user's own
 
 
 @contextmanager
