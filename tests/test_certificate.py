@@ -256,6 +256,32 @@ def test_nothing_is_proved_of_a_start_region_that_is_thinner_than_a_cell(vehicle
     assert (score.proved, score.not_broken) == (0.0, score.won)
 
 
+def test_shares_of_the_box_are_none_of_starts_that_are_drawn_where_it_loses(vehicle, monkeypatch):
+    monkeypatch.setattr(examination, "_replays", lambda certificate, scores: ())
+
+    class Even(type(vehicle)):
+        def starts(self, n, rng):
+            return rng.uniform(self.start_low, self.start_high, (n, 2))
+
+    class Late(Even):
+        def starts(self, n, rng):
+            late = rng.uniform((0.3, -0.05), (0.4, 0.05), (n, 2))
+            return np.where(rng.random((n, 1)) < 0.9, late, super().starts(n, rng))
+
+    for task, decides in ((Even(), True), (Late(), False)):
+        result, _ = examination.worst_case(
+            task,
+            np.empty((0, 2)),
+            halves(task),
+            {"hyrl": hybrid(task)},
+            (EPS,),
+            cells=60,
+            curves=False,
+        )
+        assert result.estimate != decides
+        assert decides or "starts() of vehicle draws others" in result.why_not_proved["hyrl"]
+
+
 # ---- under a sensor that remembers
 
 

@@ -98,6 +98,16 @@ def test_an_end_beyond_some_turns_is_told(tmp_path, code):
         assert why is None
 
 
+@pytest.mark.parametrize("corner", ["(2.9, 1.5)", "(3.0, 1.2)"])
+def test_where_episodes_go_on_beyond_the_chart_the_game_does_not_decide(tmp_path, corner):
+    """Before a goal line beyond it all would count as lost, and beside a corridor those who make room."""
+    robot = vehicle()
+    chart = robot.py["chart"].replace("(3.0, 1.5)", corner)
+    task = task_of(robot._replace(py=robot.py | {"chart": chart}), tmp_path)
+    why = why_no_cells(task, Grid.with_cells(task.chart, 60).counts)
+    assert "goes on where a sample leads out of its chart, as at x = " in why
+
+
 def test_a_method_that_a_proof_takes_for_the_default_must_be_it(tmp_path):
     with pytest.raises(Unbounded, match=r"methods of its own \(outcome\)"):
         check_assumptions(task_of(ROBOTS["outcome"], tmp_path))
@@ -126,6 +136,20 @@ def test_what_cannot_be_used_is_refused(tmp_path, trap):
     [
         ("COUNT = [0]", "COUNT[0] += 1", "methods change COUNT when"),
         ("RNG = np.random.default_rng()", "RNG.random()", "methods change RNG when"),
+        ("import counting", "counting.COUNT[0] += 1", "methods change COUNT when"),
+        ("K = itertools.count()", "next(K)", "methods change K when"),
+        ("def tick(n=[0]):\n    n[0] += 1", "tick()", "change a default of tick when"),
+        ("def tick():\n    tick.n += 1\n\n\ntick.n = 0", "tick()", "change n of tick when"),
+        (
+            "def made():\n    seen = deque()\n    return lambda x: seen.append(x.max())\n\n\nTICK = made()",
+            "TICK(x)",
+            "methods change seen of TICK when",
+        ),
+        (
+            "class Low:\n    y = 0.0\n\n    def __call__(self):\n        self.y += 1\n\n\nLOW = Low()",
+            "LOW()",
+            "methods change y of LOW when",
+        ),
         ("", "ends[np.random.random(len(x)) < 1e-9] = 2", "draw from a global generator"),
         (
             "WIDE = np.random.default_rng().uniform(0.8, 1.2)",
@@ -136,10 +160,33 @@ def test_what_cannot_be_used_is_refused(tmp_path, trap):
 )
 def test_what_a_file_remembers_or_draws_is_refused(tmp_path, monkeypatch, room, code, says):
     monkeypatch.setattr(
-        trapped_plants, "TASK", TASK.replace("class Robot", f"{room}\n\nclass Robot")
+        trapped_plants,
+        "TASK",
+        "import itertools\nfrom collections import deque\n"
+        + TASK.replace("class Robot", f"{room}\n\nclass Robot"),
     )
+    (tmp_path / "counting.py").write_text("COUNT = [0]\n")
     with pytest.raises(BadInput, match=says):
         check_task(task_of(ends(vehicle(), code), tmp_path))
+
+
+def test_what_is_filled_once_or_anew_each_time_is_no_memory(tmp_path, monkeypatch):
+    room = """
+class Room:
+    def __init__(self):
+        self.known, self.last = {{}}, None
+
+    def far(self, y):
+        self.last = y
+        return np.array([self.known.setdefault(round(float(v), 3), abs(v) > 1.4) for v in y])
+
+
+ROOM = Room()
+"""
+    monkeypatch.setattr(
+        trapped_plants, "TASK", TASK.replace("class Robot", f"{room}\n\nclass Robot")
+    )
+    trial.try_methods(task_of(ends(vehicle(), "ends[ROOM.far(y)] = Outcome.CRASHED"), tmp_path))
 
 
 def test_a_file_that_registers_what_can_be_registered_once_is_taken(tmp_path, monkeypatch):

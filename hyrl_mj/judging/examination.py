@@ -136,9 +136,6 @@ def examine(
     eps = subject.eps if options.eps is None else options.eps
     everywhere = options.all_coordinates or subject.everywhere
     task.check_noise(eps, everywhere)
-    count = options.episodes
-    if count is None and not subject.exact:
-        count = subject.effort.episodes
     # A kind that is named twice would count the same episodes twice.
     kinds = dict.fromkeys(options.noise or usual_kinds(task, eps, everywhere))
     noises = [noise_of(task, kind, eps, everywhere) for kind in kinds]
@@ -149,6 +146,9 @@ def examine(
             task, points, subject.parts, subject.controllers, bounds, everywhere, subject.cells,
             subject.curves,
         )  # fmt: skip
+    count = options.episodes
+    if count is None and not (subject.exact and game and not game.estimate):
+        count = subject.effort.episodes
     regions = Regions(points, _winnable(subject, maps), options.near_critical)
     counts: tuple[EpisodeCount, ...] = ()
     comparisons: tuple[Comparison, ...] = ()

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -28,6 +29,7 @@ from hyrl_mj.judging.game import (
     curve_grid,
     largest_bound,
     lattice_grid,
+    percent,
     share,
     won_in,
 )
@@ -80,7 +82,11 @@ def worst_case(
     fine = Game(task, parts, controllers, largest, everywhere, grid)
     certificate = Certificate.certify(fine, controllers)
     scores, maps = _scores(certificate, bounds)
-    replays = _replays(certificate, scores)
+    if uncounted := _why_starts_are_others(certificate, maps):
+        none = dict.fromkeys(("proved", "proved_any", "proved_time", "proved_time_any"))
+        scores = {name: tuple(replace(s, **none) for s in of) for name, of in scores.items()}
+        curves = False
+    replays = () if uncounted else _replays(certificate, scores)
     if not curves:
         coarse, margins = fine, dict.fromkeys(controllers)
         curve, profile = _known(bounds, scores), Profile((), dict.fromkeys(scores, ()))
@@ -94,15 +100,38 @@ def worst_case(
         margins = {name: x for (name, _), x in _in_threads("margins", fine.margin, likely).items()}
     spacing, curve_spacing = (tuple(g.lattice.grid.spacing.tolist()) for g in (fine, coarse))
     lattice = LatticeSpacing(
-        spacing, fine.lattice.exact, certificate.cells is not None, curve_spacing
+        spacing, fine.lattice.exact, certificate.cells is not None and not uncounted, curve_spacing
     )
+    why_not = dict.fromkeys(controllers, uncounted) if uncounted else dict(certificate.why_not)
     proved = {name: _proved_margin(curve, curve.wins[name]) for name in controllers}
     misses = _misses(coarse, controllers)
     result = GameResult(
-        everywhere, lattice, scores, margins, proved, dict(certificate.why_not), misses, curve, profile,
-        replays, sensed,
+        everywhere, lattice, scores, margins, proved, why_not, misses, curve, profile, replays, sensed,
     )  # fmt: skip
     return result, maps
+
+
+def _why_starts_are_others(certificate: Certificate, maps: Maps) -> str:
+    """Returns why shares of the start region are no shares of the starts that a task draws; "" if they are.
+
+    Scores count all of the region alike. A task may draw most of its starts where the last controller loses.
+    """
+    task, grid = certificate.game.task, certificate.game.lattice.grid
+    if type(task).starts is Task.starts or certificate.cells is None:
+        return ""
+    rng, number = np.random.default_rng(0), 100_000
+    even = rng.uniform(task.start_low, task.start_high, (number, task.chart.dimension))
+    samples = task.starts(number, rng), even[task.may_start(even)]
+    classes = [*maps.map.values()][-1]  # of the hybrid controller
+    proved = np.isin(classes, (MapClass.WON, MapClass.WON_FROM_SOME))
+    for wins in (proved, proved | (classes == MapClass.UNCLEAR)):
+        drawn, evenly = (share(wins[grid.nearest(z)]) for z in samples)
+        if drawn < NEARLY * evenly:
+            return (
+                f"the game counts all starts of the box alike, of which HyRL wins {percent(evenly)}, and "
+                f"starts() of {task.name} draws others, of which it wins {percent(drawn)}"
+            )
+    return ""
 
 
 def _scores(

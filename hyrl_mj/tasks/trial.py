@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import copy
+import inspect
 import pickle
 import random
 import sys
+from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import cached_property
-from itertools import product
+from itertools import count, product
+from pathlib import Path
+from types import FunctionType, ModuleType
 from typing import Any
 
 import mujoco
@@ -95,10 +99,12 @@ def try_methods(task: Task) -> None:
                     f"{task.chart.format(z[row])}: let it depend on this row alone, and on nothing before"
                 )
     _check_unchanged(task, own, vars(task))
-    # What a class or a module fills once, as a cache, has been filled now.
-    shared = _copied(_shared(task))
-    for asked in methods.values():
-        asked(every)
+    for _ in range(
+        2
+    ):  # what is filled once, as a cache, or each time anew is as it was after the first
+        shared = _copied(_shared(task))
+        for asked in methods.values():
+            asked(every)
     _check_unchanged(task, shared, _shared(task))
     if global_state() != chance:
         raise BadInput(
@@ -154,17 +160,39 @@ def _check_unchanged(task: Task, before: Mapping[str, Any], now: Mapping[str, An
 
 
 def _shared(task: Task) -> dict[str, Any]:
-    """Returns the variables of a task's class, and of the file that defines it, by name."""
+    """Returns the variables of a task, of its class and of the file that defines it, by name.
+
+    Beside them are those that functions keep, and the attributes of objects of the file's classes.
+    """
     kinds = [kind for kind in type(task).__mro__ if not kind.__module__.startswith("hyrl_mj.")]
     # A session of its user's may hold anything.
     names = {kind.__module__ for kind in kinds} - {"__main__", "builtins", "abc"}
-    rooms = [*(sys.modules[name] for name in names if name in sys.modules), *kinds]
-    return {n: v for room in rooms for n, v in vars(room).items() if not n.startswith("__")}
+    modules = [sys.modules[name] for name in names if name in sys.modules]
+    beside = [v for room in modules for v in vars(room).values() if _is_beside(task, v)]
+    names |= {module.__name__ for module in beside}
+    rooms = [*beside, *modules, *kinds, task]
+    found = {n: v for room in rooms for n, v in vars(room).items() if not n.startswith("__")}
+    for name, value in [*found.items()]:
+        kept: dict[str, Any] = {}
+        if isinstance(value, FunctionType):
+            function = inspect.unwrap(value)
+            kept = {**inspect.getclosurevars(function).nonlocals, **vars(function)}
+            kept["a default"] = [function.__defaults__, function.__kwdefaults__]
+        elif type(value).__module__ in names:
+            kept = getattr(value, "__dict__", {})
+        found |= {f"{n} of {name}": v for n, v in kept.items()}
+    return found
+
+
+def _is_beside(task: Task, value: Any) -> bool:
+    """Returns whether a value is a module that lies beside the file of a task."""
+    path = getattr(value, "__file__", None) if isinstance(value, ModuleType) else None
+    return bool(path and task.source and task.source.parent in Path(path).parents)
 
 
 def _copied(variables: Mapping[str, Any]) -> dict[str, Any]:
     """Returns copies of plain variables by name, of generators of random numbers what tells their state."""
-    kinds = (bool, int, float, str, list, dict, set, np.ndarray, np.generic)
+    kinds = (bool, int, float, str, list, dict, set, deque, np.ndarray, np.generic)
     chance = (np.random.Generator, np.random.RandomState, random.Random)
     found: dict[str, Any] = {}
     for name, value in variables.items():
@@ -173,6 +201,8 @@ def _copied(variables: Mapping[str, Any]) -> dict[str, Any]:
                 found[name] = copy.deepcopy(value)
             elif isinstance(value, chance):
                 found[name] = pickle.dumps(value)  # to compare it: nothing loads it
+            elif isinstance(value, count):
+                found[name] = repr(value)
     return found
 
 

@@ -86,6 +86,7 @@ class Cells(Places):
                 f"the plant of {task.name} does not move all states alike: with the same input some move "
                 f"{error.max():.2g} farther than others"
             )
+        _check_chart(lattice)
         # Where every sample moves cells onto cells, only rounding adds up over an episode.
         cells = lattice.hops / h
         drift = task.max_steps * (np.abs(cells - np.round(cells)) * h + error).max(axis=0)
@@ -251,6 +252,21 @@ class Cells(Places):
         """Returns a chart point inside of each of cells (n,): (n, d)."""
         off = rng.uniform(-0.5, 0.5, (len(cells), len(self.counts)))
         return self.middle(cells) + off * self.lattice.grid.spacing
+
+
+def _check_chart(lattice: Lattice) -> None:
+    """Raises `Unbounded` if an episode may go on beyond the chart, where nothing is known of what it wins."""
+    task, nodes = lattice.task, lattice.grid.nodes[lattice.running]
+    for hop in lattice.hops:
+        out = nodes + hop
+        out = out[~task.chart.contains(out)]
+        goes_on = task.ending(out) == Outcome.RUNNING
+        if goes_on.any():
+            raise Unbounded(
+                f"an episode of {task.name} goes on where a sample leads out of its chart, as at "
+                f"{task.chart.format(out[goes_on][0])}, and nothing is known of what is won from there: let "
+                "ending() end it, or make the chart wider"
+            )
 
 
 def _ends(task: Task, boxes: Affine) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
