@@ -119,6 +119,7 @@ REFUSED = {
     "late sensor": "is 0.1 s late, and the true state is taken from the sensors",
     "short sensor": "is measured as x = 2 m",
     "starts": r"of 4,000 starts that starts\(\) draws lie outside of its box, as",
+    "a start that is over": r"[1-9] of 4,000 starts are over before they begin: .* is crashed",
     "mirror": r"mirror is no symmetry of it: x = .*\((running|crashed), reward",
     "count": r"gives \d and then \d for the same row|methods change count",
     "other rows": r"gives \d and then \d for the same row",

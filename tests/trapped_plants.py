@@ -202,6 +202,9 @@ ROBOTS = {
             "scenery": '<geom name="wall" type="box" size="0.001 3 0.2" pos="1.213 0 0"/>',
         },
     ),
+    "a start that is over": ends(
+        vehicle(), "ends[np.hypot(x - 0.2, y - 0.3) < 0.02] = Outcome.CRASHED"
+    ),
     "mirror": mirrored(0.05),
     "starts": methods(
         vehicle(),

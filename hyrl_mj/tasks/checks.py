@@ -340,11 +340,14 @@ def _check_starts(task: Task) -> None:
         _check_noise_of_chart(task, everywhere)
     if type(task).plant is Task.plant:
         _check_turns(task, np.vstack([z, task.chart.draw(STARTS, np.random.default_rng(4))]))
+    if type(task).plant is Task.plant:  # few of them may be over
+        z = task.starts(task.effort.starts, np.random.default_rng(2))
+        measurement = task.placed(z).measurement
     ending = task.ending(measurement)
     over = np.flatnonzero(ending != Outcome.RUNNING)
     if len(over):
         raise BadInput(
-            f"{len(over)} of {STARTS} starts are over before they begin: {task.chart.format(z[over[0]])} "
+            f"{len(over):,} of {len(z):,} starts are over before they begin: {task.chart.format(z[over[0]])} "
             f"is {Outcome(ending[over[0]]).label}; start elsewhere, or change ending()"
         )
 
