@@ -102,7 +102,7 @@ def test_cells_are_longer_along_a_coordinate_that_changes_faster(unicycle):
 
 def test_a_lattice_that_holds_the_robot_in_its_place_is_refused(vehicle):
     coarse = Grid.with_cells(vehicle.chart, 40)
-    assert not resolves(coarse, probed_hops(vehicle))
+    assert not resolves(vehicle, coarse, probed_hops(vehicle))
     with pytest.raises(
         BadInput, match=r"no sample moves vehicle.*0\.075 m by 0\.075 m.*--episodes"
     ):
@@ -305,3 +305,11 @@ def test_a_map_is_cut_to_the_section_that_is_drawn(unicycle, rough):
     assert tuple(cut.grid_counts) == rough.grid.counts[:2]
     assert len(cut.map["policy"]) == math.prod(rough.grid.counts[:2])
     assert np.abs(cut.map["policy"]).max() <= 1, "the section lies at heading 0"
+
+
+def test_rounding_holds_a_robot_along_a_slow_coordinate_too(vehicle):
+    """It crosses a cell along x, and along y only in many samples; where an episode is short, it does not."""
+    grid = Grid.with_cells(vehicle.chart, 120)
+    fast = probed_hops(vehicle)
+    for slower, holds in ((1.0, True), (0.1, False), (1e-5, True)):
+        assert resolves(vehicle, grid, fast * (1.0, slower)) == holds

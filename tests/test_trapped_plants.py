@@ -152,6 +152,7 @@ def test_what_cannot_be_used_is_refused(tmp_path, trap):
             "methods change y of LOW when",
         ),
         ("", "ends[np.random.random(len(x)) < 1e-9] = 2", "draw from a global generator"),
+        ("", "ends[(x > 1) & (np.random.default_rng().random(len(x)) < 0.02)] = 2", "the same row"),
         (
             "WIDE = np.random.default_rng().uniform(0.8, 1.2)",
             "ends[(x - 1.5) ** 2 + y**2 <= WIDE] = Outcome.CRASHED",
@@ -263,6 +264,7 @@ def test_who_hovers_beside_a_small_goal_has_not_arrived(tmp_path):
     [
         ("danger", "(self, measured):\n        return measured[:, 1] - measured[:, 1].mean()"),
         ("miss", "(self, z):\n        return 9 + z[:, 1] - z[:, 1].min()"),
+        ("measure", "(self, sensors):\n        return sensors - 1e-7 * sensors.mean(axis=0)"),
         ("state", "(self, z, rng=None):\n        return z, z - z.mean(axis=0)"),
         ("direction", "(self, path):\n        return np.random.randint(0, 2, path.shape[1])"),
     ],

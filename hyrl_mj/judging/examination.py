@@ -146,10 +146,12 @@ def examine(
             task, points, subject.parts, subject.controllers, bounds, everywhere, subject.cells,
             subject.curves,
         )  # fmt: skip
+    decides = subject.exact and game is not None and not game.estimate
     count = options.episodes
-    if count is None and not (subject.exact and game and not game.estimate):
+    if count is None and not decides:
         count = subject.effort.episodes
-    regions = Regions(points, _winnable(subject, maps), options.near_critical)
+    winnable = _winnable(subject, maps) if decides else None
+    regions = Regions(points, winnable, options.near_critical)
     counts: tuple[EpisodeCount, ...] = ()
     comparisons: tuple[Comparison, ...] = ()
     if count is not None:
@@ -183,7 +185,7 @@ def examine(
 
 def _winnable(subject: Subject, maps: Maps | None) -> tuple[Grid, np.ndarray] | None:
     """Returns the game's nodes with those (N,) bool that are winnable, None where that is not known."""
-    if maps is None or not (subject.exact and subject.winnable):
+    if maps is None or not subject.winnable:
         return None
     classes = [*maps.map.values()][-1]  # of the hybrid controller
     return maps.grid(subject.task.chart), ~np.isin(classes, (MapClass.UNWINNABLE, MapClass.OVER))

@@ -83,7 +83,9 @@ def worst_case(
     certificate = Certificate.certify(fine, controllers)
     scores, maps = _scores(certificate, bounds)
     if uncounted := _why_starts_are_others(certificate, maps):
-        none = dict.fromkeys(("proved", "proved_any", "proved_time", "proved_time_any"))
+        none: dict[str, Any] = dict.fromkeys(
+            ("proved", "proved_any", "proved_time", "proved_time_any")
+        )
         scores = {name: tuple(replace(s, **none) for s in of) for name, of in scores.items()}
         curves = False
     replays = () if uncounted else _replays(certificate, scores)

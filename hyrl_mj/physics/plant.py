@@ -128,9 +128,14 @@ class Plant:
     @property
     def measurement(self) -> np.ndarray:
         """The current measurement without noise: (n, p), a copy."""
+        return self._measure(self.sensors)
+
+    @property
+    def sensors(self) -> np.ndarray:
+        """The current values of the sensors, of which `measure` makes the measurement: (n, s), a copy."""
         if self._columns_of_state is None:
-            return self._measure(self._sensors.copy())
-        return self._measure(self._batch.state[:, self._columns_of_state])
+            return self._sensors.copy()
+        return self._batch.state[:, self._columns_of_state]
 
     def truth(self, ids: np.ndarray) -> np.ndarray:
         """Returns the `measurement` (k, p) of the copies `ids` (k,); environments tell them apart."""

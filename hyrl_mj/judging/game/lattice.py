@@ -124,12 +124,12 @@ class Lattice(Places):
         hops = probed_hops(task)
         if transitions(task, grid, hops) > MOST_TRANSITIONS:
             return f"a lattice of {len(grid.nodes):,} nodes with all inputs does not fit into the memory"
-        if not resolves(grid, hops):
+        if not resolves(task, grid, hops):
             pairs = zip(grid.spacing, task.chart.units, strict=True)
             sides = " by ".join(f"{side:.3g} {unit}" for side, unit in pairs)
             return (
-                f"no sample moves {task.name} by a whole cell of the lattice ({sides}), and rounding would "
-                "hold it in its place"
+                f"no sample moves {task.name} by a whole cell of the lattice ({sides}) along a coordinate, "
+                "and rounding would hold it in its place"
             )
         return None
 

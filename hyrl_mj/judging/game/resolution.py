@@ -68,7 +68,7 @@ def lattice_grid(task: Task, cells: int = 0, most: int | None = None) -> Grid:
 def curve_grid(task: Task, cells: int = 0) -> Grid:
     """Returns the nodes of a lattice of at most `CURVE_CELLS`, of more where a sample is too short for it."""
     coarse = lattice_grid(task, cells, CURVE_CELLS[task.chart.dimension])
-    return coarse if resolves(coarse, probed_hops(task)) else lattice_grid(task, cells)
+    return coarse if resolves(task, coarse, probed_hops(task)) else lattice_grid(task, cells)
 
 
 def probed_hops(task: Task) -> np.ndarray:
@@ -144,9 +144,17 @@ def longest(hops: np.ndarray) -> np.ndarray:
     return np.asarray(np.abs(hops).reshape(-1, hops.shape[-1]).max(axis=0))
 
 
-def resolves(grid: Grid, hops: np.ndarray) -> bool:
-    """Returns whether one sample can move the robot by a cell: otherwise rounding holds it in its place."""
-    return bool((longest(hops) >= grid.spacing * (1 - 1e-6)).any())
+def resolves(task: Task, grid: Grid, hops: np.ndarray) -> bool:
+    """Returns whether one sample can move the robot by a cell: otherwise rounding holds it in its place.
+
+    It has to along each coordinate that an episode changes by half a cell, unless nodes are drawn around the
+    end of a sample, which is right on average.
+    """
+    far = longest(hops)
+    crosses = far >= grid.spacing * (1 - 1e-6)
+    drawn = task.chart.dimension > 2 or task.abilities.stopped_by_walls
+    held = (far * task.max_steps >= grid.spacing / 2) & ~crosses
+    return bool(crosses.any() and (drawn or not held.any()))
 
 
 def level_counts(task: Task, grid: Grid, hops: np.ndarray) -> tuple[int, ...]:
