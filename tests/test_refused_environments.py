@@ -212,6 +212,16 @@ class Sampling(Puck):
         return super().step(0.9 * action + 0.1 * self.action_space.sample())
 
 
+class Loaded(Puck):
+    """Its load is drawn by its action space, which no seed of reset() decides, either."""
+
+    def begin(self, place):
+        self.share = 0.5 + 0.1 * abs(self.action_space.sample()[0])
+
+    def control(self, action):
+        super().control(self.share * action)
+
+
 SOURCES = {
     "random": (lambda _: random.Random(3), lambda _, source: source.random()),
     "method": (lambda _: random.Random(3).random, lambda _, source: source()),
@@ -681,6 +691,7 @@ DRAWN = {
     ),
     "of a global generator": (Global, {"seed": 0}, "draws goal from a global generator"),
     "of its own": (OwnGenerator, {}, r"in reset\(\), from a generator .* not decide \(rng\)"),
+    "by its space": (Loaded, {"seed": 0}, r"from a generator .* not decide \(action_space"),
     "where it began": (Since, {}, "each reset of Since draws begun"),
     "a border of its place": (Tide, {"steps": 60}, "each reset of Tide draws wave"),
     "wear": (Worn, {}, "draws actuator_gainprm of its model"),

@@ -4,7 +4,8 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from environments import GOAL, XML, Home, Puck
+from environments import GOAL, XML, Home, Puck, outcomes
+from gymnasium.wrappers import FrameStackObservation, TransformReward
 from planted import without_judges
 
 from hyrl_mj import BadInput, from_gymnasium
@@ -76,6 +77,21 @@ class Fading(Home):
 
     def control(self, action):
         super().control(np.asarray(action) * min(1.0, self.far / 4))
+
+
+class Patrol(Home):
+    """It loses where it comes back to its charger, which lies on the pilot's way."""
+
+    def first(self):
+        return np.array([0.62, 0.77])
+
+    def begin(self, place):
+        self.charger, self.left = place.copy(), False
+
+    def crashed(self):
+        away = float(np.linalg.norm(self.data.qpos - self.charger))
+        self.left = self.left or away > 0.8
+        return self.left and away < 0.2
 
 
 class Late(Puck):
@@ -341,9 +357,12 @@ STAYS = {
     "numbers in its code": (Fading, {}, r"far\)"),
     "what matters late": (Late, {"steps": 200}, ".*share"),
     "a leash": (Leashed, {"steps": None}, r"home\)"),
+    "a leash below frames": (
+        lambda: FrameStackObservation(Leashed(), 2), {"steps": None}, r".*home\)",
+    ),
     "the place before": (Speeding, {"steps": None}, r"before\)"),
     "a marker": (FenceByMarker, SEED, r"site_pos of its model\)"),
-}
+}  # fmt: skip
 OTHERWISE = {
     "a second state": (Twin, {}, r"step\(\) of Twin leads to one x, wherever .* by a second one"),
     "a fence that is drawn": (
@@ -376,6 +395,11 @@ def test_what_stays_at_the_place_of_the_reset_is_refused(name, monkeypatch):
     make, given, message = TABLE[name]
     with pytest.raises(BadInput, match=message):
         from_gymnasium(make, **{"steps": 60, **given})
+
+
+def test_what_a_reset_notes_and_few_runs_come_to_is_refused_there():
+    with pytest.raises(BadInput, match=r"notes where it leads to \(charger\)"):
+        outcomes(Patrol, starts=np.array([[-0.8, 1.0], [-1.3, 0.5]]))
 
 
 class Later(Puck):
@@ -587,6 +611,17 @@ class Muscles(OnePlace):
 
 
 @pytest.mark.first(4)
+class Viewed(Puck):
+    """It keeps a view of MuJoCo's positions, and what its model was built from."""
+
+    def __init__(self):
+        super().__init__()
+        self.place, self.spec = self.data.qpos[:2], mujoco.MjSpec()
+
+    def _get_obs(self):
+        return super()._get_obs() | {"position": self.place.copy()}
+
+
 @pytest.mark.parametrize(
     ("make", "given"),
     [
@@ -598,6 +633,7 @@ class Muscles(OnePlace):
         (Servo, {}),
         (Muscles, {}),
         (Renamed, {}),
+        (lambda: TransformReward(Viewed(), float), {}),
         (Speeding, {"starts": "reset"}),
         (Heading, {"pinned": {"qpos[2]": 0.0}}),
     ],

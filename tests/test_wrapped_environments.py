@@ -25,6 +25,7 @@ from environments import (
     pilot,
     plain,
 )  # fmt: skip
+from gymnasium import spaces
 from gymnasium.wrappers import (
     ClipAction,
     DelayObservation,
@@ -685,6 +686,22 @@ class Far(Flat):
 def test_functions_get_the_precision_of_the_environment_and_a_reset_may_have_no_options():
     task = from_gymnasium(Far, steps=60)
     assert ends(task, pilot=lambda o: pilot(o - Far.origin)) == plain()
+
+
+class Parts(Flat):
+    """Observes parts within parts."""
+
+    observation_space = spaces.Tuple(
+        [spaces.Dict({"place": numbers(2), "to_goal": numbers(2)}), numbers(2)]
+    )
+
+    def _get_obs(self):
+        place, to_goal, velocity = np.split(super()._get_obs(), 3)
+        return {"place": place, "to_goal": to_goal}, velocity
+
+
+def test_parts_within_parts_are_joined_in_their_order():
+    assert outcomes(lambda: FlattenObservation(Parts()), 0.15) == plain(0.15)
 
 
 def delayed_frames():

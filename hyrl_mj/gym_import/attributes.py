@@ -21,19 +21,25 @@ from hyrl_mj.gym_import.fingerprint import (
     has_no_memory,
     is_of_torch,
 )
+from hyrl_mj.gym_import.opening import physics_of
 
 
 def held(inner: Any, info: dict[str, Any]) -> Iterator[tuple[str, Any, Any]]:
     """Yields name, owner and key of values in `info` and in attributes, also within objects.
 
+    Views of MuJoCo's arrays are left out, as what they show is its state.
     What an owner holds, `value_at` gives.
     """
-    seen = {id(inner)}
+    seen, (_, data) = {id(inner)}, physics_of(inner) or (None, None)
+    begins = data.qpos.ctypes.data if data else 0
+    state = range(begins, begins + (data.nbuffer if data else 0))  # where MuJoCo keeps it
     for kind, owner in (("info", info), ("attribute", getattr(inner, "__dict__", {}))):
-        yield from _within(owner, f"{kind} ", seen, 0)
+        yield from _within(owner, f"{kind} ", seen, state, 0)
 
 
-def _within(owner: Any, path: str, seen: set[int], depth: int) -> Iterator[tuple[str, Any, Any]]:
+def _within(
+    owner: Any, path: str, seen: set[int], state: range, depth: int
+) -> Iterator[tuple[str, Any, Any]]:
     """Yields names, owners and keys of what a dictionary, a list, or an object with slots holds."""
     if isinstance(owner, dict):
         parts = [*owner.items()]
@@ -42,6 +48,8 @@ def _within(owner: Any, path: str, seen: set[int], depth: int) -> Iterator[tuple
     else:
         parts = [(name, getattr(owner, name)) for name in _slots(owner) if hasattr(owner, name)]
     for key, value in parts:
+        if isinstance(value, np.ndarray) and value.ctypes.data in state:
+            continue
         if taken_apart(value) is not None:
             yield f"{path}{key}", owner, key
         elif depth < DEEPEST and id(value) not in seen:
@@ -53,7 +61,7 @@ def _within(owner: Any, path: str, seen: set[int], depth: int) -> Iterator[tuple
                 passed = isinstance(value, FUNCTIONS) or has_no_memory(value)
                 owners = [] if passed else [getattr(value, "__dict__", {}), value]
             for within in owners:
-                yield from _within(within, f"{path}{key}.", seen, depth + 1)
+                yield from _within(within, f"{path}{key}.", seen, state, depth + 1)
 
 
 def _slots(value: Any) -> list[str]:

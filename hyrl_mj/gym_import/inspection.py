@@ -107,7 +107,7 @@ def inspect(description: Description, untried: bool = False) -> tuple[Pool, Inst
     if instance.is_wrapped:
         check_told(instance.spec)
         instance.learn(sensing=senses(instance.spec))
-    check_noted(instance.spec, resets)
+    instance.learn(led=check_noted(instance.spec, resets))
     pool.learn(instance.spec)
     moves, at_rest = trials.moving(pool)
     trials.check_noise(pool)

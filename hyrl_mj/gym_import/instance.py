@@ -136,7 +136,7 @@ class Instance:
             plain: whether the options and the pins that the user gives are left out.
         """
         description = self.spec.description
-        by_seed = description.seed is not None or "goal" in self.spec.found
+        by_seed = self.lead or description.seed is not None or "goal" in self.spec.found
         if seed is None and (self.own is None or by_seed or not self._was_reset):
             seed = description.seed or 0
         given = {} if plain else description.reset
@@ -145,7 +145,6 @@ class Instance:
         if seed is not None:
             np.random.seed(seed)
             random.seed(seed)
-            self._actions.seed(seed)
         given_options = {"options": options} if options else {}
         before, tracer = global_state(), sys.gettrace()
         try:

@@ -30,25 +30,34 @@ def columns_of(space: spaces.Space[Any]) -> dict[str, slice]:
 
 
 def flat(observation: Any, space: spaces.Space[Any]) -> np.ndarray:
-    """Returns an observation as a vector, as SB3 does: the parts of a Dict in the order of its space."""
-    if isinstance(space, spaces.Dict):
-        parts = [np.asarray(observation[k]).reshape(-1) for k in space.spaces]
-        return np.concatenate(parts, dtype=float)
+    """Returns an observation as a vector, as SB3 does: the parts of a Dict in the order of its space.
+
+    That of an environment within wrappers may be a Tuple, or have parts within parts.
+    """
+    if parts := _keyed(space):
+        return np.concatenate([flat(observation[k], part) for k, part in parts], dtype=float)
     return np.array(observation, dtype=float).ravel()
+
+
+def _keyed(space: spaces.Space[Any]) -> list[tuple[Any, Any]]:
+    """Returns the parts of a Dict or a Tuple with the keys by which observations hold them."""
+    if isinstance(space, spaces.Dict):
+        return [*space.spaces.items()]
+    return [*enumerate(space.spaces)] if isinstance(space, spaces.Tuple) else []
 
 
 def shaped(vector: np.ndarray, like: Any, space: spaces.Space[Any]) -> Any:
     """Returns a vector as an observation of the shape and types of another one."""
-    if not isinstance(space, spaces.Dict):
+    if not (parts := _keyed(space)):
         array = np.asarray(like)
         values = vector.astype(array.dtype).reshape(array.shape)
         return type(like)(values.tolist()) if type(like) in (list, tuple) else values
-    parts, at = {}, 0
-    for key, part in space.spaces.items():
-        array = np.asarray(like[key])
-        parts[key] = shaped(vector[at : at + array.size], array, part)
-        at += array.size
-    return {key: parts[key] for key in like if key in parts}
+    ends = np.cumsum([flat(like[key], part).size for key, part in parts])
+    vectors = np.split(vector, ends[:-1])
+    found = {key: shaped(v, like[key], part) for v, (key, part) in zip(vectors, parts, strict=True)}
+    if isinstance(space, spaces.Tuple):
+        return tuple(found.values())
+    return {key: found[key] for key in like if key in found}
 
 
 def observers(env: gym.Env) -> dict[str, Callable[[], Any]]:

@@ -181,8 +181,10 @@ def steps_of(env: gym.Env) -> int | None:
     ]
     if limits:
         return min(limits)
-    if env.spec is not None and env.spec.max_episode_steps:
-        return int(env.spec.max_episode_steps)
+    if most := getattr(
+        env.unwrapped.spec, "max_episode_steps", None
+    ):  # some keep an MjSpec of that name
+        return int(most)
     limit = getattr(getattr(env.unwrapped, "_env", None), "_step_limit", np.inf)  # of dm_control
     return int(limit) if np.isfinite(limit) else None
 

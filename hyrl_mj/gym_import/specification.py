@@ -188,6 +188,7 @@ class EnvironmentSpec:
         plane: the axes of the world that the first two coordinates follow; none if they do not.
         recalled: (o,) bool, the columns of the innermost observation that episodes change apart from the
             state, whatever their places.
+        led: how runs that are judged are led to their starts; None where resets note nothing.
         derived: `Derived`.
         sensing: how `derived` is shown to wrappers that read MuJoCo's state for what they observe, and see it
             under noise; "" if none does.
@@ -226,6 +227,7 @@ class EnvironmentSpec:
     islands: Mapping[str, int] = field(default_factory=dict)
     plane: tuple[Axis, ...] = ()
     recalled: np.ndarray = field(default_factory=_none)
+    led: Any = None
     derived: Derived = "unknown"
     sensing: Derived | Literal[""] = ""
     moves: np.ndarray = field(default_factory=_none)

@@ -72,6 +72,7 @@ class Stage:
         self._lived: dict[bool, Instance] = {}  # which is never replaced
         self._wears = False  # whether something has outlasted a reset
         self._veiled: list[Instance] = []
+        self._led: list[Instance] = []
         self._resting: Instance | None = None
         self._fresh: Instance | None = None  # which has only been reset
         self._shared: written.Fingerprint | None = None  # by a new instance with all others
@@ -168,6 +169,8 @@ class Stage:
             self._judge(run, run.noise, as_it_is)
             if len(runs) > 1 and (i < LIVED or self._wears) and run.outcome != Outcome.UNSTABLE:
                 self._live(run, as_it_is)
+            if self.spec.led is not None:
+                self._lead(run)
             if not run.noise.any():
                 continue
             alike = self._judge(run, np.zeros_like(run.noise), as_it_is)
@@ -222,6 +225,21 @@ class Stage:
         # A reward that no episode is judged by may be normalised by those before.
         rewards = run.rewards if "reward" in self.spec.criterion.asked else None
         judge(replace(run, rewards=rewards), lived, run.noise, None)
+
+    def _lead(self, run: Played) -> None:
+        """Plays a run from a reset that is led to its start, as its user would have it lead there."""
+        (usual, led), how = (self._renewed(self._led) for _ in range(2)), self.spec.led
+        noted = how.noted(usual, led, run.start)
+        usual, led = self._renewed([usual]), self._renewed([led])
+        if noted:
+            with how.to(led, run.start):
+                if not self.spec.wrapped:
+                    led.reset()
+                try:
+                    judge(replace(run, rewards=None), led, run.noise, None)
+                except BadInput as error:
+                    raise how.refused(led.name, noted) from error
+        self._led += [usual, led]
 
     def _acted(
         self, instances: Sequence[Instance], u: np.ndarray, begun: np.ndarray | None = None
@@ -358,8 +376,8 @@ def _goes_another_way(real: Instance, how: str) -> BadInput:
         return _changes(real, how)
     return BadInput(
         f"{real.name} goes another way than a new one from the same start with the same inputs: {how} in the "
-        "new one; it depends on other episodes, on time, on chance, on wrappers around a time limit, or on "
-        "what it observes"
+        "new one; it depends on other episodes, on time, on chance, on a callback of all instances (as of "
+        "set_mjcb_passive), on wrappers around a time limit, or on what it observes"
     )
 
 

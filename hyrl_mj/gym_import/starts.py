@@ -8,8 +8,9 @@ load that is tied to the robot. So a reset is made to lead to the start, and run
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from itertools import chain
 from types import FrameType
 from typing import Any
@@ -44,15 +45,19 @@ FEW = 200
 VIOLATED = 1e-3
 
 
-def check_noted(spec: EnvironmentSpec, resets: Resets) -> None:
+def check_noted(spec: EnvironmentSpec, resets: Resets) -> Led | None:
     """Raises `BadInput` if a run from a start on the chart is not as a reset to there would have it go.
 
     Runs that are put to a start are compared with those that a reset begins which is led there. Their inputs
-    do not change, which leads far away.
+    do not change, which leads far away; where resets note anything, all runs that are judged are, too.
+
+    Returns:
+        How these are; None if resets note nothing.
     """
     _check_ties(spec, resets)
-    _check_led(spec)
+    led = _check_led(spec)
     _check_begun(spec)
+    return led
 
 
 def _starts(spec: EnvironmentSpec, rng: np.random.Generator) -> np.ndarray:
@@ -92,37 +97,78 @@ def _check_ties(spec: EnvironmentSpec, resets: Resets) -> None:
 # ---- a reset is led to the start
 
 
-def _check_led(spec: EnvironmentSpec) -> None:
+@dataclass(frozen=True)
+class Led:
+    """How the resets of an environment are led to a start; see `_Lead`.
+
+    Attributes:
+        homes, holders: see `_homes` and `_holders`.
+    """
+
+    homes: Sequence[str]
+    holders: Mapping[str, np.ndarray]
+
+    @contextmanager
+    def to(self, instance: Instance, state: np.ndarray) -> Iterator[None]:
+        """Leads resets of an instance to a state of MuJoCo (S,) within the block, which leave it all else."""
+        instance.own = np.append(own_of(instance), instance.physics.columns["warmstart"])
+        try:
+            with _Lead(instance, state[instance.spec.places], self.homes, self.holders):
+                yield
+        finally:
+            instance.own = None
+
+    def noted(self, usual: Instance, led: Instance, state: np.ndarray) -> list[str]:
+        """Puts two instances to a state (S,), one by a reset that is led there.
+
+        Returns:
+            The names of what they hold otherwise since then; none if they cannot be compared.
+        """
+        before = differing(led.memory(), usual.memory())  # as spaces that draw their seeds
+        usual.put(state)
+        try:
+            with self.to(led, state):
+                led.put(state)
+        except BadInput:  # it cannot begin there
+            return []
+        states = led.physics.read(), usual.physics.read()
+        moved = np.flatnonzero(~np.isclose(*states, rtol=SAME, atol=SAME))
+        memory = led.memory()
+        noted = [name for name in differing(memory, usual.memory()) if name not in before]
+        # Where it draws other numbers, as until something is far enough away, all else is another draw.
+        if {*noted} & {*memory.generators} or usual.physics.depth(
+            usual.spec.solid
+        ) > usual.spec.depth:
+            return []
+        return noted + [usual.physics.names[at] for at in moved]
+
+    def refused(self, name: str, noted: Sequence[str]) -> BadInput:
+        """Returns the error that a run of an environment goes otherwise because of what its reset notes."""
+        return BadInput(
+            f"reset() of {name} notes where it leads to ({', '.join(noted[:4])}), and step() "
+            "goes by that, so a start elsewhere on the chart is none of its own: let the first "
+            "step() note it, pin it, or give starts='reset' if all resets lead to one place"
+        )
+
+
+def _check_led(spec: EnvironmentSpec) -> Led | None:
     """Raises `BadInput` if a run goes otherwise where the reset before it is led to its start.
 
     What such a reset notes as numbers is also moved farther, where limits on it show.
+
+    Returns:
+        How other runs are tried so; None if resets note nothing.
     """
     rng, usual, led = np.random.default_rng(11), Instance(spec), Instance(spec)
-    homes, holders = _homes(spec), _holders(Instance(spec))
+    how, notes = Led(_homes(spec), _holders(Instance(spec))), False
     none = np.zeros((spec.max_steps, spec.dimension))
-    own = np.append(own_of(usual), usual.physics.columns["warmstart"])
     for i, state in enumerate(_starts(spec, rng)):
         inputs = [usual.drawn(rng)] * spec.max_steps
         for farther in (0, FAR, -FAR) if i < EPISODES // 2 else (0,):
             usual, led = map(renewed, (usual, led))
-            usual.put(state)
-            led.own = own  # all else in MuJoCo as the reset leaves it
-            try:
-                with _Lead(led, state[spec.places], homes, holders):
-                    led.put(state, spec.description.seed or 0)
-            except BadInput:  # it cannot begin there
+            if not (noted := how.noted(usual, led, state)):
                 break
-            finally:
-                led.own = None
-            states = led.physics.read(), usual.physics.read()
-            moved = np.flatnonzero(~np.isclose(*states, rtol=SAME, atol=SAME))
-            noted = differing(memory := led.memory(), usual.memory())
-            # Where it draws other numbers, as until something is far enough away, all else is another draw.
-            if {*noted} & {*memory.generators} or usual.physics.depth(spec.solid) > spec.depth:
-                break
-            noted += [usual.physics.names[at] for at in moved]
-            if not noted:
-                break
+            notes = True
             if farther:
                 here, there = (numbers_in(one.inner) for one in (usual, led))
                 shared = [n for n in there if len(there[n]) == len(here.get(n, ()))]
@@ -134,11 +180,8 @@ def _check_led(spec: EnvironmentSpec) -> None:
             except BadInput:  # it fails with values that it does not know
                 apart = True
             if apart:
-                raise BadInput(
-                    f"reset() of {spec.name} notes where it leads to ({', '.join(noted[:4])}), and step() "
-                    "goes by that, so a start elsewhere on the chart is none of its own: let the first "
-                    "step() note it, pin it, or give starts='reset' if all resets lead to one place"
-                )
+                raise how.refused(spec.name, noted)
+    return how if notes else None
 
 
 def _go_apart(spec: EnvironmentSpec, ours: Iterable[Seen], theirs: Iterable[Seen]) -> bool:
