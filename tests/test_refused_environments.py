@@ -691,7 +691,7 @@ DRAWN = {
     ),
     "of a global generator": (Global, {"seed": 0}, "draws goal from a global generator"),
     "of its own": (OwnGenerator, {}, r"in reset\(\), from a generator .* not decide \(rng\)"),
-    "by its space": (Loaded, {"seed": 0}, r"from a generator .* not decide \(action_space"),
+    "by its space": (Loaded, {"seed": 0}, EPISODE.format("share")),
     "where it began": (Since, {}, "each reset of Since draws begun"),
     "a border of its place": (Tide, {"steps": 60}, "each reset of Tide draws wave"),
     "wear": (Worn, {}, "draws actuator_gainprm of its model"),

@@ -59,6 +59,17 @@ class FenceAtOnePlace(Fence):
     draws = False
 
 
+class Planning(Fence):
+    """It computes for long before it notes its place."""
+
+    draws = False
+
+    def begin(self, place):
+        for _ in range(60_000):
+            pass
+        super().begin(place)
+
+
 class Leashed(Home):
     """It ends far from where the reset led to, where a run comes late or never."""
 
@@ -368,6 +379,7 @@ OTHERWISE = {
     "a fence that is drawn": (
         Fence, {}, "draws home, .* first step",
     ),
+    "what takes long": (Planning, {}, r"reset\(\) of Planning takes more than 100,000 lines"),
     "a region": (FenceByRegion, {}, r"draws region|notes where it leads to \(region"),
     "a load": (Tied, XY, "or limits of tendons tie the robot of Tied"),
     "a rope": (Towing, XY, "tie the robot of Towing to something that stays"),

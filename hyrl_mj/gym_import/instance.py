@@ -145,6 +145,8 @@ class Instance:
         if seed is not None:
             np.random.seed(seed)
             random.seed(seed)
+            if self.own is None or self.lead:  # which its user does not seed
+                self._actions.seed(seed)
         given_options = {"options": options} if options else {}
         before, tracer = global_state(), sys.gettrace()
         try:

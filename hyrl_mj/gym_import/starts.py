@@ -162,6 +162,8 @@ def _check_led(spec: EnvironmentSpec) -> Led | None:
     rng, usual, led = np.random.default_rng(11), Instance(spec), Instance(spec)
     how, notes = Led(_homes(spec), _holders(Instance(spec))), False
     none = np.zeros((spec.max_steps, spec.dimension))
+    with how.to(led, spec.state):  # to where it leads anyway, which it can
+        led.reset()
     for i, state in enumerate(_starts(spec, rng)):
         inputs = [usual.drawn(rng)] * spec.max_steps
         for farther in (0, FAR, -FAR) if i < EPISODES // 2 else (0,):
@@ -241,7 +243,10 @@ class _Lead:
             return None
         self._lines += 1
         if self._lines > LINES:
-            raise BadInput(f"a reset of {self._instance.name} does not end")
+            raise BadInput(
+                f"reset() of {self._instance.name} takes more than {LINES:,} lines of Python, too many "
+                "to see whether it notes where it leads to: let it compute less, as once where it is made"
+            )
         if self._holders is None:
             return self
         for c, value in zip(self._instance.spec.coordinates, self._place, strict=True):
