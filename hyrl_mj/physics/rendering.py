@@ -18,7 +18,9 @@ from hyrl_mj.physics import mjcf
 from hyrl_mj.system import forked
 from hyrl_mj.system.gl import GL_PROBLEM
 
-GL_CURE = "on Debian or Ubuntu: apt-get install libegl1 libopengl0 libgl1-mesa-dri, and set MUJOCO_GL=egl"
+GL_CURE = (
+    "on Debian or Ubuntu: apt-get install libegl1 libopengl0 libgl1-mesa-dri, and set MUJOCO_GL=egl"
+)
 
 # Largest width and height of a picture [pixels].
 LARGEST = 4096
