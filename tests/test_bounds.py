@@ -21,9 +21,9 @@ from hyrl_mj.judging.proof.networks import BoundedPolicy
 from hyrl_mj.judging.proof.rules import RULES, Truth, bounds
 from hyrl_mj.policies import (
     ACTIVATIONS,
+    HybridController,
     MlpPolicy,
     Normalization,
-    PolicyController,
     PreprocessedPolicy,
     Preprocessing,
 )
@@ -427,18 +427,25 @@ def test_a_cell_moves_onto_cells_that_hold_whatever_the_plant_does(which, cells,
 
 
 @pytest.mark.parametrize("which", ["vehicle", "unit_circle"])
-def test_answers_hold_all_cells_that_a_policy_leads_to(which, cells, ring):
-    of, rng = (cells if which == "vehicle" else ring), RNG(6)
+def test_answers_hold_all_that_a_controller_does_under_noise(which, cells, ring):
+    of, rng, n = (cells if which == "vehicle" else ring), RNG(6), 5_000
     task = of.lattice.task
-    policy = network(task)
-    answers = BoundedAnswers.enclose(of, PolicyController(policy), task.noise_in_chart(0.1))
-    boxes, (shifts,) = answers.boxes, answers.shifts
-    chosen = {tuple(shift): where for shift, where in shifts}
-    index = rng.integers(boxes.counts, size=(5_000, len(boxes.counts)))
-    u = policy.act(boxes.low + boxes.step * (index + rng.uniform(0, 1, index.shape)))
-    for box, *ends in zip(map(tuple, index), *of.shifts(u, u), strict=True):
-        assert all(chosen[tuple(end)][box] for end in ends)
-    assert len(chosen) > 1
+    grid = Grid.with_cells(task.chart, 60)
+    first = grid.nodes[:, -1] < grid.nodes[:, -1].mean() + 0.1
+    sets = {0: GridSet.from_mask(grid, first), 1: GridSet.from_mask(grid, ~first)}
+    controller = HybridController(task, {q: network(task, seed=q) for q in (0, 1)}, sets)
+    bound = task.noise_in_chart(0.1)
+    answers = BoundedAnswers.enclose(of, controller, bound)
+    place = rng.integers(of.nodes, size=n)
+    z = of.draw(place, rng) + bound * rng.choice([-1.0, 1.0, rng.uniform(-1, 1)], (n, 1))
+    for before, possible in zip((0, 1, -1), answers.possible(bound), strict=True):
+        found = {(mode, *shift): where for mode, shift, where in possible}
+        q = controller.initial_mode(z) if before < 0 else np.full(n, before)
+        u, after = controller.step(q, z)
+        for k, first_shift, last_shift in zip(range(n), *of.shifts(u, u), strict=True):
+            for shift in (first_shift, last_shift):
+                assert found[after[k], *shift][place[k]]
+        assert np.mean([where.mean() for where in found.values()]) < 0.6, "and little else"
 
 
 def test_cells_fail_where_any_of_their_states_does(cells):
