@@ -443,6 +443,10 @@ def test_answers_hold_all_that_a_controller_does_under_noise(which, cells, ring)
             found = {(mode, *shift): where for mode, shift, where in possible}
             q = controller.initial_mode(z) if before < 0 else np.full(n, before)
             u, after = controller.step(q, z)
+            box = np.floor((task.chart.wrap(z) - answers.boxes.low) / answers.boxes.step).astype(
+                int
+            )
+            assert answers.goes[(before, after, *box.T)].all()
             for k, *shifts in zip(range(n), *of.shifts(u, u), strict=True):
                 assert all(found[after[k], *shift][place[k]] for shift in shifts)
             assert np.mean([where.mean() for where in found.values()]) < 0.6, "and little else"
