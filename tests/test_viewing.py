@@ -384,3 +384,49 @@ def test_what_cannot_be_simulated_is_said_on_the_page(page):
     page._simulate()
     assert "-1" in page.told.content
     assert page.track.arc is before
+
+
+def test_what_no_page_offers_is_said_on_the_page(page):
+    before = chosen(page, 3.0)
+    for control in (page.controller, page.mode, page.noise):
+        usual, control._impl.value = control.value, "![x](/etc/passwd)<img src=x onerror=alert(1)>"
+        page._simulate()
+        control._impl.value = usual
+        assert "unknown choice" in page.told.content
+        assert not re.search(
+            r"(?<!\\)[<\[]", page.told.content
+        )  # which the page would take for HTML
+    assert page.track.arc is before
+
+
+def test_of_what_is_sent_a_page_takes_what_pages_send():
+    from msgspec.msgpack import encode
+
+    def usual(**message):
+        return viewing._is_usual(encode(message))
+
+    own = {"type": "GuiUpdateMessage", "uuid": "1"}
+    turn, place = [1.0, 0.0, 0.0, 0], [1, 2, 3]
+    assert all(usual(**own, updates={"value": v}) for v in (True, 1, -0.5, "uniform", place))
+    wrong = (
+        np.nan,
+        -np.inf,
+        1e300,
+        None,
+        {},
+        [],
+        [1.0],
+        [np.nan] * 3,
+        ["a"] * 3,
+        [place] * 3,
+        "a" * 501,
+    )
+    assert not any(usual(**own, updates={"value": v}) for v in wrong)
+    for updates in ({"removed": True}, {"props": 1}, {"value": 1, "props": 1}, {}, [], 1, "value"):
+        assert not usual(**own, updates=updates)
+    moved = {"type": "TransformControlsUpdateMessage", "name": "start", "owner": ""}
+    assert usual(**moved, wxyz=turn, position=place)
+    assert not usual(**moved, wxyz=turn, position=turn)
+    assert not usual(type="ShareUrlRequest")  # it would make the page public
+    for content in (b"", b"\x91" * 100_000, "text", encode([1]), encode({"type": []}), encode({})):
+        assert not viewing._is_usual(content)

@@ -11,7 +11,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from hyrl_mj.errors import BadInput
+from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.runs.arcs import OF_RUNS, critical_starts, noisy_arcs
 from hyrl_mj.runs.directory import Run
 from hyrl_mj.sets import Grid
@@ -22,6 +22,7 @@ from hyrl_mj.viz.replay import marks
 from hyrl_mj.viz.replay.panel import Track
 from hyrl_mj.viz.section import Section
 from hyrl_mj.viz.shows import replay_floor
+from hyrl_mj.viz.tables import escaped
 from hyrl_mj.viz.viewing import FPS, PAUSE, served, show
 
 CONTROLLERS = {"HyRL": "hyrl", "the policy alone": "policy"}
@@ -132,22 +133,26 @@ class Page:
             self._told = self.t
             self.told.content = (
                 f"**{arc.ending(task).replace('_', ' ')}** after {arc.t[-1]:.2f} s, jumps: {arc.j[-1]}\n\n"
-                f"now t = {t:.2f} s, {task.chart.format(track.z(t))}, mode: {mode}"
+                f"now t = {t:.2f} s, {escaped(task.chart.format(track.z(t)))}, mode: {escaped(mode)}"
             )
 
     def _simulate(self) -> None:
         """Simulates what the controls ask for; says why if that cannot be done."""
+        task, bound = self.run.task, self.bound.value
         z0 = np.array([[slider.value for slider in self.start]])
-        who, q0 = CONTROLLERS[self.controller.value], self._modes[self.mode.value]
         try:
-            task = self.run.task
+            for control in (self.controller, self.mode, self.noise):
+                if (
+                    control.value not in control.options
+                ):  # others than the page may ask for anything
+                    raise unknown("choice", control.value, control.options)
+            who, q0 = CONTROLLERS[self.controller.value], self._modes[self.mode.value]
             z0 = task.chart.check(z0, task.name)
-            bound = self.bound.value
             arcs = noisy_arcs(self.run, z0, self.noise.value, bound, (q0,), seed=self._seed)
         except BadInput as error:
             if not hasattr(self, "track"):  # there is nothing else to show
                 raise
-            self.told.content = f"**{error}**"
+            self.told.content = f"**{escaped(error)}**"
             return
         found = {name.split("_")[0]: arc for name, (arc,) in arcs.items()}
         modes = self.run.extended_sets.modes

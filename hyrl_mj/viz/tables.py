@@ -67,13 +67,14 @@ class Table:
 
 def markdown(table: Table) -> str:
     """Returns a table to paste as Markdown."""
-    lines = [_escaped(table.headings), ["---"] * len(table.headings), *map(_escaped, table.rows)]
+    head, *rows = [[*map(escaped, row)] for row in (table.headings, *table.rows)]
+    lines = [head, ["---"] * len(head), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def _escaped(cells: Iterable[object]) -> list[str]:
-    """Returns cells that hold no Markdown: no column, no link and no element of HTML."""
-    return [re.sub(r"([\\|\[\]<>`])", r"\\\1", str(cell)) for cell in cells]
+def escaped(text: object) -> str:
+    """Returns a text that holds no Markdown: no column, no link, no picture and no element of HTML."""
+    return re.sub(r"([\\|\[\]<>`])", r"\\\1", str(text))
 
 
 def spread(middle: float, ends: Iterable[float], show: Callable[[float], str]) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import socket
 import time
+from asyncio import get_running_loop
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, redirect_stdout
 from copy import copy
@@ -20,7 +21,7 @@ from urllib.parse import urlsplit
 
 import mujoco
 
-from hyrl_mj.errors import BadInput
+from hyrl_mj.errors import LARGEST_NUMBER, LONGEST, BadInput
 from hyrl_mj.physics import mjcf
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.system.gl import has_display
@@ -31,6 +32,11 @@ from hyrl_mj.viz.replay.panel import Track
 FPS = 60
 PAUSE = 1.0  # [s] between the end of an arc and its beginning
 LOOPBACK = "127.0.0.1"
+# What a page of ours sends: what its user chooses, its camera, and where a handle is.
+MESSAGES = (
+    "GuiUpdateMessage", "ViewerCameraMessage", "TransformControlsUpdateMessage",
+    "TransformControlsDragStartMessage", "TransformControlsDragEndMessage",
+)  # fmt: skip
 
 
 def view(task: Task, arc: HybridArc, port: int = 0, say: Say = print) -> None:
@@ -140,16 +146,24 @@ def served(
 def _for_this_machine() -> Iterator[None]:
     """Lets servers that are begun in the block refuse the pages of other addresses that a browser holds open.
 
-    viser looks neither at the host that a browser asks for nor at the page that asks. What else a stranger
-    sends ends the connection, and writes nothing to the terminal.
+    viser looks neither at the host that a browser asks for nor at the page that asks, sets any attribute of
+    a control that a message names, and makes the page public if one asks for that. What a page of ours does
+    not send is passed over, and writes nothing to the terminal.
     """
     from websockets.asyncio import server
+
+    class Connection(server.ServerConnection):
+        async def recv(self, decode: bool | None = None) -> Any:
+            while not _is_usual(content := await super().recv(decode)):
+                pass
+            return content
 
     serve, silent = server.serve, logging.getLogger("hyrl_mj.viewer")
     silent.disabled = True
 
     def checked(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
         async def answer(connection: Any, request: Any) -> Any:
+            get_running_loop().set_exception_handler(lambda *_: None)  # of viser's thread
             hosts, origins = map(request.headers.get_all, ("Host", "Origin"))
             known = [host.rpartition(":")[0] in (LOOPBACK, "localhost") for host in hosts] == [True]
             if not known or any(urlsplit(origin).netloc != hosts[0] for origin in origins):
@@ -157,10 +171,34 @@ def _for_this_machine() -> Iterator[None]:
             found = process_request and process_request(connection, request)
             return await found if isawaitable(found) else found
 
-        return serve(*arguments, process_request=answer, **{**options, "logger": silent})
+        own = {"logger": silent, "max_size": 2**16, "create_connection": Connection}
+        return serve(*arguments, process_request=answer, **{**options, **own})
 
     setattr(server, "serve", checked)  # noqa: B010 - mypy takes it for a type
     try:
         yield
     finally:
         setattr(server, "serve", serve)  # noqa: B010
+
+
+def _is_usual(content: Any) -> bool:
+    """Returns whether a page sends this: a choice of its user, its camera, or the place of a handle."""
+    from msgspec import DecodeError, msgpack
+
+    try:
+        message = msgpack.decode(content)
+        known = message["type"] in MESSAGES and [*message.get("updates", ["value"])] == ["value"]
+        values = {**message, **message.get("updates", {})}
+    except (DecodeError, TypeError, KeyError, AttributeError, RecursionError):
+        return False
+    return known and all(_is_plain(values[name], name) for name in values if name != "updates")
+
+
+def _is_plain(value: Any, name: str) -> bool:
+    """Returns whether a value is a short text, a number, or the numbers of a vector, a turn or a colour."""
+    if isinstance(value, list):
+        numbers = [v for v in value if isinstance(v, int | float) and _is_plain(v, name)]
+        return len(value) == len(numbers) == (4 if name == "wxyz" else 3)
+    if isinstance(value, str):
+        return len(value) <= LONGEST
+    return isinstance(value, int | float) and abs(value) <= LARGEST_NUMBER  # not NaN
