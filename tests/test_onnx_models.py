@@ -169,6 +169,11 @@ def test_sizes_that_depend_on_the_observation_are_refused(circle, tmp_path):
     refused(path, circle, "the size of what its operator Range gives depends on the observation")
 
 
+def test_operators_that_stand_in_another_order_are_refused(circle, tmp_path):
+    nodes = [node("Expand", "g s", "e"), node("ReduceSum", "e"), node("Cast", "g", "s", to=INT)]
+    refused(saved(tmp_path, nodes), circle, "Expand stands before what it takes is computed")
+
+
 def test_sizes_that_depend_on_the_number_of_observations_are_taken(circle, tmp_path):
     nodes = [node("Shape", "g", "s"), node("ConstantOfShape", "s", "z"), node("Add", "g z")]
     policy = load_agent(saved(tmp_path, nodes), circle)

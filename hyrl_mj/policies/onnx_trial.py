@@ -59,7 +59,11 @@ def check(model: onnx.ModelProto) -> None:
     tensors += [t for s in graph.sparse_initializer for t in (s.values, s.indices)]
     constants = {tensor.name for tensor in graph.initializer}
     seen = {value.name for value in graph.input} - constants
+    known = seen | constants | {s.values.name for s in graph.sparse_initializer} | {""}
     for node in graph.node:
+        if not known.issuperset(node.input):  # onnxruntime would sort them
+            raise Refused(f"its operator {node.op_type} stands before what it takes is computed")
+        known.update(node.output)
         if node.domain not in ("", "ai.onnx") or node.op_type not in OPERATORS:
             name = ".".join(filter(None, (node.domain, node.op_type)))
             raise Refused(f"its operator {name} is none that a policy needs")
