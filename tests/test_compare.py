@@ -674,6 +674,9 @@ def test_of_alternatives_without_a_seed_in_common_nothing_is_said(three):
         three, rows=tuple(replace(r, seed=r.seed + 3 * (r.name == "stack")) for r in three.rows)
     )
     assert [*sentences(apart)] == ["Table, seed 0: the chart has 5 dimensions."]
+    # A file of a stranger's may leave a figure out.
+    bare = replace(three, rows=tuple(replace(r, figures={}) for r in three.rows))
+    assert [*sentences(bare)] == ["Table, seed 0: the chart has 5 dimensions."]
 
 
 def test_without_three_seeds_there_is_no_interval(three):

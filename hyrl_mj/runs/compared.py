@@ -106,11 +106,12 @@ class Compared:
     def both(self, name: str) -> np.ndarray:
         """Returns what an alternative and HyRL win under attack, and of how many starts (0 if not known).
 
-        These are rows (n, 3) of the seeds that both have.
+        These are rows (n, 3) of the seeds for which both have been attacked.
         """
         other, hyrl = ({row.seed: row.figures for row in self.of(n)} for n in (name, "hyrl"))
         pairs = [(other[s], hyrl[s]) for s in other if s in hyrl]
-        rows = [(a["worst"], b["worst"], b.get("attacked", 0.0)) for a, b in pairs]
+        both = [pair for pair in pairs if all("worst" in figures for figures in pair)]
+        rows = [(a["worst"], b["worst"], b.get("attacked", 0.0)) for a, b in both]
         return np.reshape(rows, (-1, 3))
 
     def difference(self, name: str) -> Mean:

@@ -21,6 +21,7 @@ from attacks.forgery import setting, write
 from attacks.honest import ARGUMENTS
 from attacks.material import RUN, TASK, Material
 from attacks.small import become_nobody
+from hyrl_mj.pipeline.comparing import _code
 
 SECRET = "this is the user's own"
 ESCAPE = "\x1b]0;owned\x07"
@@ -175,12 +176,15 @@ def comparison(memory: float, draw: Random, folder: Path) -> str:
             "tried": {},
             "samples": 1,
         }
-        return {"name": name, **usual, "seconds": 1.0, "figures": figures} | more
+        # By their code, which a stranger knows, too, the rows are not made anew.
+        code = _code(hyrl_mj.get_task(TASK), name)
+        return {"name": name, **usual, "seconds": 1.0, "figures": figures, "code": code} | more
 
     other = row(draw.choice(TEXTS), **draw.choice((
         {"title": draw.choice((*TEXTS, "$x^$", "a" * 100_000)), "sentence": draw.choice(TEXTS)},
         {"tried": dict.fromkeys(TEXTS, 0.5), "sentence": "a" * 100_000},
         {"figures": {"worst": draw.choice(numbers), draw.choice(TEXTS): draw.choice(numbers)}},
+        {"figures": draw.choice(({}, {"won": 0.5}, {"worst": 0.5, "attacked": -1e-30}))},
         {"samples": draw.choice(numbers), "seed": draw.choice(numbers)},
         {"state": "unfit", "sentence": draw.choice(TEXTS)},
     )))  # fmt: skip
