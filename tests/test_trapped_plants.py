@@ -138,11 +138,18 @@ def test_what_cannot_be_used_is_refused(tmp_path, trap):
         ("COUNT = [0]", "COUNT[0] += 1", "methods change COUNT when"),
         ("RNG = np.random.default_rng()", "RNG.random()", "methods change RNG when"),
         ("import counting", "counting.COUNT[0] += 1", "methods change COUNT when"),
+        ("from ticking import tick", "tick()", "methods change COUNT when"),
         ("K = itertools.count()", "next(K)", "methods change K when"),
         ("def tick(n=[0]):\n    n[0] += 1", "tick()", "change a default of tick when"),
         ("def tick():\n    tick.n += 1\n\n\ntick.n = 0", "tick()", "change n of tick when"),
         (
             "def made():\n    seen = deque()\n    return lambda x: seen.append(x.max())\n\n\nTICK = made()",
+            "TICK(x)",
+            "methods change seen of TICK when",
+        ),
+        (
+            "def counted(f, seen=0):\n    @functools.wraps(f)\n    def g(x):\n        nonlocal seen\n"
+            "        seen += 1\n        return f(x)\n    return g\n\n\nTICK = counted(lambda x: x)",
             "TICK(x)",
             "methods change seen of TICK when",
         ),
@@ -164,16 +171,27 @@ def test_what_a_file_remembers_or_draws_is_refused(tmp_path, monkeypatch, room, 
     monkeypatch.setattr(
         trapped_plants,
         "TASK",
-        "import itertools\nfrom collections import deque\n"
+        "import functools\nimport itertools\nfrom collections import deque\n"
         + TASK.replace("class Robot", f"{room}\n\nclass Robot"),
     )
-    (tmp_path / "counting.py").write_text("COUNT = [0]\n")
+    for name in ("counting", "ticking"):
+        text = "COUNT = [0]\n\n\ndef tick():\n    COUNT[0] += 1\n"
+        (tmp_path / f"{name}.py").write_text(text)
     with pytest.raises(BadInput, match=says):
         check_task(task_of(ends(vehicle(), code), tmp_path))
 
 
 def test_what_is_filled_once_or_anew_each_time_is_no_memory(tmp_path, monkeypatch):
     room = """
+import functools
+import math
+
+
+@functools.wraps(math.hypot)  # which is no function of Python
+def hypot(*sides):
+    return math.hypot(*sides)
+
+
 class Room:
     def __init__(self):
         self.known, self.last = {{}}, None

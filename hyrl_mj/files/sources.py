@@ -116,10 +116,15 @@ def check_helpers(path: Path) -> None:
             )
 
 
+def helpers(path: Path) -> dict[str, ModuleType]:
+    """Returns the modules that were imported of those beside a task that it imports, by name."""
+    names = _beside(path)
+    return {m: module for m, module in sys.modules.items() if m.partition(".")[0] in names}
+
+
 def forget_helpers(path: Path) -> dict[str, ModuleType]:
     """Lets what a task imports from its folder be imported anew; returns what was imported so far."""
-    names = _beside(path)
-    found = {m: module for m, module in sys.modules.items() if m.partition(".")[0] in names}
+    found = helpers(path)
     for module in found:
         del sys.modules[module]
     return found

@@ -12,14 +12,14 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import cached_property
 from itertools import count, product
-from pathlib import Path
-from types import FunctionType, ModuleType
+from types import FunctionType
 from typing import Any
 
 import mujoco
 import numpy as np
 
 from hyrl_mj.errors import BadInput
+from hyrl_mj.files.sources import helpers
 from hyrl_mj.physics import mjcf, mujoco_log
 from hyrl_mj.sets import Grid
 from hyrl_mj.system.generators import global_state
@@ -92,7 +92,7 @@ def try_methods(task: Task) -> None:
         alone = first.copy()
         for row in order[:STARTS]:
             alone[row] = asked(np.array([row]))[0]
-        # An environment answers each time by Python code of its own.
+        # Each answer of an environment takes Python code of its user's, which is slow.
         often = STARTS if type(task).plant is Task.plant else 1
         for again in (shuffled, alone, *(asked(every) for _ in range(often))):
             if (row := _differing_row(again, first)) is not None:
@@ -121,9 +121,8 @@ def _try_again(task: Task) -> None:
     for name in sorted(vars(Task)["__annotations__"].keys() - {"source", "env_id", "spec"}):
         now, again = getattr(task, name, None), getattr(twin, name, None)
         kinds = type(now), type(again)
-        anew = (
-            kinds[0] is not kinds[1] and kinds[0].__name__ == kinds[1].__name__
-        )  # a class of the file
+        # Of a class of the file, which is another one where that is executed once more.
+        anew = kinds[0] is not kinds[1] and kinds[0].__name__ == kinds[1].__name__
         if not (name.startswith("_") or anew or alike(now, again)):
             raise BadInput(
                 f"{name} is {now!r:.60}, and {again!r:.60} where {task.source} is executed once more, as "
@@ -161,34 +160,29 @@ def _check_unchanged(task: Task, before: Mapping[str, Any], now: Mapping[str, An
 
 
 def _shared(task: Task) -> dict[str, Any]:
-    """Returns the variables of a task, of its class and of the file that defines it, by name.
+    """Returns the variables of a task, of its class and of its code, by name.
 
-    Beside them are those that functions keep, and the attributes of objects of the file's classes.
+    That is the file that defines it, and what this imports from its folder. With them are what functions
+    keep, and the attributes of objects of classes that are defined there.
     """
     kinds = [kind for kind in type(task).__mro__ if not kind.__module__.startswith("hyrl_mj.")]
     # A session of its user's may hold anything.
     names = {kind.__module__ for kind in kinds} - {"__main__", "builtins", "abc"}
+    names |= helpers(task.source).keys() if task.source else set()
     modules = [sys.modules[name] for name in names if name in sys.modules]
-    beside = [v for room in modules for v in vars(room).values() if _is_beside(task, v)]
-    names |= {module.__name__ for module in beside}
-    rooms = [*beside, *modules, *kinds, task]
+    rooms = [*modules, *kinds, task]
     found = {n: v for room in rooms for n, v in vars(room).items() if not n.startswith("__")}
     for name, value in [*found.items()]:
         kept: dict[str, Any] = {}
         if isinstance(value, FunctionType):
-            function = inspect.unwrap(value)
-            kept = {**inspect.getclosurevars(function).nonlocals, **vars(function)}
-            kept["a default"] = [function.__defaults__, function.__kwdefaults__]
+            with suppress(TypeError, ValueError):  # what it wraps may be no function of Python
+                for function in (value, inspect.unwrap(value)):
+                    kept |= {**inspect.getclosurevars(function).nonlocals, **vars(function)}
+                    kept["a default"] = [function.__defaults__, function.__kwdefaults__]
         elif type(value).__module__ in names:
             kept = getattr(value, "__dict__", {})
         found |= {f"{n} of {name}": v for n, v in kept.items()}
     return found
-
-
-def _is_beside(task: Task, value: Any) -> bool:
-    """Returns whether a value is a module that lies beside the file of a task."""
-    path = getattr(value, "__file__", None) if isinstance(value, ModuleType) else None
-    return bool(path and task.source and task.source.parent in Path(path).parents)
 
 
 def _copied(variables: Mapping[str, Any]) -> dict[str, Any]:
