@@ -315,7 +315,7 @@ def _check_starts(task: Task) -> None:
     if len(outside):
         point = task.chart.format(outside[0])
         raise BadInput(f"it starts outside its chart, at {point}: change one of them")
-    _check_box(task)
+    drawn = _check_box(task)
     plant = task.placed(z, np.random.default_rng(1))
     moves = task.model.nkey and task.model.key_qvel[0].any()
     if type(task).plant is Task.plant and moves and task.state(z)[1] is None:
@@ -340,9 +340,7 @@ def _check_starts(task: Task) -> None:
         _check_noise_of_chart(task, everywhere)
     if type(task).plant is Task.plant:
         _check_turns(task, np.vstack([z, task.chart.draw(STARTS, np.random.default_rng(4))]))
-    if type(task).plant is Task.plant:  # few of them may be over
-        z = task.starts(task.effort.starts, np.random.default_rng(2))
-        measurement = task.placed(z).measurement
+        z, measurement = drawn, task.placed(drawn).measurement  # of which few may be over
     ending = task.ending(measurement)
     over = np.flatnonzero(ending != Outcome.RUNNING)
     if len(over):
@@ -440,8 +438,8 @@ def _check_noise_of_chart(task: Task, measurement: np.ndarray) -> None:
         )
 
 
-def _check_box(task: Task) -> None:
-    """Raises `BadInput` unless the starts that are drawn are starts that the task says may be."""
+def _check_box(task: Task) -> np.ndarray:
+    """Returns starts (n, d) that are drawn; raises `BadInput` unless the task says that they may be."""
     drawn = task.starts(task.effort.starts, np.random.default_rng(2))
     off = ~(task.chart.contains(drawn) & task.may_start(drawn))
     if off.any():
@@ -451,6 +449,7 @@ def _check_box(task: Task) -> None:
             f"{task.chart.format(drawn[off][0])}: what is not in the box from {low} to {high} (start_low, "
             "start_high, may_start) is not examined; change one of them"
         )
+    return drawn
 
 
 def _check_ways(task: Task) -> None:
