@@ -1,6 +1,8 @@
 """The attack on a run: what is written, read, printed, played and judged."""
 
 import shutil
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,9 +12,11 @@ from test_verdict import ALL, EPS, HOLDS, enough, episodes
 
 import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, load_run
+from hyrl_mj.judging import examination
 from hyrl_mj.judging.game import AttackCount, Robustness, wilson
 from hyrl_mj.judging.verdict import Verdict, Word
 from hyrl_mj.pipeline import ExamineOptions, examine_run, run_stage
+from hyrl_mj.pipeline.steps import subject_of
 from hyrl_mj.runs.arcs import noisy_arcs
 from hyrl_mj.runs.directory import Run
 from hyrl_mj.tasks import SPARING
@@ -99,6 +103,17 @@ def test_a_run_with_a_game_is_attacked_only_on_request(examined, monkeypatch):
     assert (
         ExamineOptions(attack_starts=9).budget(SPARING, run.exact).rounds == SPARING.attack_rounds
     )
+
+
+def test_a_run_whose_game_turns_out_to_decide_nothing_is_attacked(examined, monkeypatch):
+    """As where starts are drawn otherwise than the game counts them, which the maps tell."""
+    run, game = load_run(examined), SimpleNamespace(estimate=True)
+    monkeypatch.setattr(examination, "worst_case", lambda *_: (game, None))
+    subject = subject_of(run, run.controllers, run.split)
+    subject = replace(subject, playable=True, exact=True, effort=replace(SPARING, attack_starts=9))
+    options = ExamineOptions(episodes=1, noise=("none",))
+    for attacked in (True, False):
+        assert bool(examination.examine(subject, options, attacked).robustness.attacks) == attacked
 
 
 def test_the_rounds_of_a_time_repeat_it(copied):

@@ -449,7 +449,7 @@ def test_in_three_dimensions_the_game_is_an_estimate_beside_the_episodes(
     examine_run(run, ExamineOptions(episodes=8), say=str)
     page = page_of(path)
     assert len(page.table("noisy episodes")) == len(run.robustness.episodes)
-    assert ("Rounding makes this an estimate" in page.text) == game
+    assert ("This is an estimate" in page.text) == game
     said = page.text.replace("verdict: winnable", "")  # a setting
     assert ("winnable" in said) == game
     assert ("stand in for the worst case, because it is not wanted here." in page.text) != game

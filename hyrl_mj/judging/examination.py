@@ -120,17 +120,17 @@ class Examination:
 
 
 def examine(
-    subject: Subject, options: ExamineOptions = USUAL, budget: Budget | None = None
+    subject: Subject, options: ExamineOptions = USUAL, attacked: bool = False
 ) -> Examination:
     """Examines controllers under noise, by the game where it can be played, by episodes, and by an attack.
 
     Args:
         subject: the controllers and their task.
         options: noise bound and kinds, numbers of episodes and attacked starts.
-        budget: of the attack; by default there is none.
+        attacked: whether there is an attack, if the options ask for one or the game does not decide.
 
     Raises:
-        BadInput: a bound that cannot be used.
+        BadInput: a bound that cannot be used, or both a time and a number of rounds.
     """
     task, points = subject.task, subject.points
     eps = subject.eps if options.eps is None else options.eps
@@ -162,6 +162,7 @@ def examine(
         eps, everywhere, game, counts, options.seed,
         comparisons=comparisons, near_critical=options.near_critical,
     )  # fmt: skip
+    budget = options.budget(subject.effort, decides) if attacked else None
     if budget is None:
         return Examination(results, maps)
     starts = options.attack_starts or subject.effort.attack_starts

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from typing import Any
 
@@ -31,6 +31,7 @@ from hyrl_mj.judging.game import (
     lattice_grid,
     percent,
     share,
+    wilson,
     won_in,
 )
 from hyrl_mj.judging.proof.cells import why_no_cells
@@ -38,6 +39,7 @@ from hyrl_mj.judging.proof.certificate import Certificate
 from hyrl_mj.judging.proof.counterexamples import Broken, beaten, find_counterexamples
 from hyrl_mj.judging.proof.replays import replay
 from hyrl_mj.judging.proof.sensed import prove_under
+from hyrl_mj.judging.sentences import NAMES
 from hyrl_mj.policies import BLAS, Controller
 from hyrl_mj.sets import GridSet
 from hyrl_mj.simulation import NOT_STARTED, LoopSettings, Sensor, closed_loop, covers_sensor
@@ -83,9 +85,9 @@ def worst_case(
     certificate = Certificate.certify(fine, controllers)
     scores, maps = _scores(certificate, bounds)
     if uncounted := _why_starts_are_others(certificate, maps):
-        none: dict[str, Any] = dict.fromkeys(
-            ("proved", "proved_any", "proved_time", "proved_time_any")
-        )
+        why_not = dict.fromkeys(controllers, uncounted)
+        certificate = replace(certificate, cells=None, answers={}, why_not=why_not)
+        none: dict[str, Any] = dict.fromkeys(s.name for s in fields(Score) if "proved" in s.name)
         scores = {name: tuple(replace(s, **none) for s in of) for name, of in scores.items()}
         curves = False
     replays = () if uncounted else _replays(certificate, scores)
@@ -102,13 +104,13 @@ def worst_case(
         margins = {name: x for (name, _), x in _in_threads("margins", fine.margin, likely).items()}
     spacing, curve_spacing = (tuple(g.lattice.grid.spacing.tolist()) for g in (fine, coarse))
     lattice = LatticeSpacing(
-        spacing, fine.lattice.exact, certificate.cells is not None and not uncounted, curve_spacing
+        spacing, fine.lattice.exact, certificate.cells is not None, curve_spacing
     )
-    why_not = dict.fromkeys(controllers, uncounted) if uncounted else dict(certificate.why_not)
     proved = {name: _proved_margin(curve, curve.wins[name]) for name in controllers}
     misses = _misses(coarse, controllers)
     result = GameResult(
-        everywhere, lattice, scores, margins, proved, why_not, misses, curve, profile, replays, sensed,
+        everywhere, lattice, scores, margins, proved, dict(certificate.why_not), misses, curve, profile,
+        replays, sensed,
     )  # fmt: skip
     return result, maps
 
@@ -124,14 +126,16 @@ def _why_starts_are_others(certificate: Certificate, maps: Maps) -> str:
     rng, number = np.random.default_rng(0), 100_000
     even = rng.uniform(task.start_low, task.start_high, (number, task.chart.dimension))
     samples = task.starts(number, rng), even[task.may_start(even)]
-    classes = [*maps.map.values()][-1]  # of the hybrid controller
+    name, classes = [*maps.map.items()][-1]  # of the hybrid controller
     proved = np.isin(classes, (MapClass.WON, MapClass.WON_FROM_SOME))
     for wins in (proved, proved | (classes == MapClass.UNCLEAR)):
-        drawn, evenly = (share(wins[grid.nearest(z)]) for z in samples)
-        if drawn < NEARLY * evenly:
+        won = [wins[grid.nearest(z)] for z in samples]
+        (_, most), (least, _) = (wilson(int(one.sum()), len(one)) for one in won)
+        if most < NEARLY * least:  # by more than chance
+            drawn, evenly = map(percent, map(share, won))
             return (
-                f"the game counts all starts of the box alike, of which HyRL wins {percent(evenly)}, and "
-                f"starts() of {task.name} draws others, of which it wins {percent(drawn)}"
+                f"the game counts all starts of the box alike, of which {NAMES.get(name, name)} wins "
+                f"{evenly}, and starts() of {task.name} draws others, of which it wins {drawn}"
             )
     return ""
 

@@ -266,8 +266,7 @@ def figures_of(made: Run, controller: Controller, seed: int) -> dict[str, float]
     options = ExamineOptions(
         episodes=effort.episodes, attack_starts=effort.attack_starts, seed=1_000 + seed
     )
-    budget = Budget(rounds=effort.attack_rounds)
-    result = examine(subject, options, budget).robustness
+    result = examine(subject, options, attacked=True).robustness
     found = {**_shares(result), **_manners(made, controller, seed)}
     return {name: value for name, value in found.items() if np.isfinite(value)}
 

@@ -206,8 +206,8 @@ def _retrained(
 def examine_stage(run: Run, say: Say, options: ExamineOptions = USUAL) -> None:
     """Examines policy and hybrid controller under noise; all files are written at the end."""
     subject = replace(subject_of(run, run.controllers, run.split), alike=run.keeps_agent)
-    budget = options.budget(subject.effort, subject.exact)  # a wrong one is refused before the work
-    found = examine(subject, options, budget)
+    options.budget(subject.effort, subject.exact)  # a wrong one is refused before the work
+    found = examine(subject, options, attacked=True)
     for name, arc in found.arcs.items():
         arc.save(run.attack_path(name))
     if found.maps is not None:

@@ -196,9 +196,7 @@ def score_table(task: Task, game: GameResult) -> Table:
     estimated = ", an estimate" if game.estimate else ""
     spacing = " by ".join(f"{round(side, 5)}" for side in game.lattice.spacing)
     units = ", ".join(dict.fromkeys(task.chart.units))
-    rounding = (
-        'Rounding makes this an estimate: "open" and "winnable" may be too much or too little. '
-    )
+    caution = 'This is an estimate: "open" and "winnable" may be too much or too little. '
     note = (
         f'Played on a lattice of states, {spacing} {units} apart. "Open" is what one who sees the state can '
         'win, "winnable" what this split can win by deciding the way from the measurement; the other shares '
@@ -211,7 +209,7 @@ def score_table(task: Task, game: GameResult) -> Table:
         for who, why in game.why_not_proved.items()
     ]
     title = f"{task.name}: worst case over all noise signals{estimated}"
-    return Table.of(title, rows, rounding * game.estimate + note, remarks)
+    return Table.of(title, rows, caution * game.estimate + note, remarks)
 
 
 def proved_text(share: float | None) -> str:
