@@ -415,6 +415,12 @@ def test_a_module_that_ends_in_tanh_is_refused_where_inputs_have_other_limits(ci
     assert hyrl_mj.from_callable(half, circle).act(np.ones((2, 1))).shape == (2, 1)
 
 
+def test_a_part_of_a_module_that_is_called_act_is_none_of_its_methods(circle):
+    network = torch.nn.Linear(2, 1)
+    network.act = torch.nn.ReLU()
+    assert hyrl_mj.from_callable(network, circle).act(np.ones((2, 1))).shape == (2, 1)
+
+
 class Pair(torch.nn.Module):
     def forward(self, o):
         return o, o

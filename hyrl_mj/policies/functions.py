@@ -354,7 +354,8 @@ def from_callable(function: PythonAgent, task: Task) -> FunctionPolicy | Remembe
         if _last_part(function) == "Tanh":
             check_scaled(task, "the module")
     if callable(function):
-        if others := [n for n in ("predict", "act") if callable(getattr(function, n, None))]:
+        # Of its class: a module may hold a part by that name, as self.act = nn.ReLU().
+        if others := [n for n in ("predict", "act") if callable(getattr(type(function), n, None))]:
             raise BadInput(
                 f"{type(function).__name__} can be called, and has {others[0]}() as well, which may answer "
                 f"otherwise: give a function that calls the one that acts, as lambda o: agent.{others[0]}(o)"
