@@ -145,7 +145,7 @@ class Instance:
         if seed is not None:
             np.random.seed(seed)
             random.seed(seed)
-            if self.own is None or self.lead:  # which its user does not seed
+            if self.own is None or self.lead:  # a user of one that goes on does not seed them
                 self._actions.seed(seed)
         given_options = {"options": options} if options else {}
         before, tracer = global_state(), sys.gettrace()

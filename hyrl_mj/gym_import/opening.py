@@ -181,9 +181,8 @@ def steps_of(env: gym.Env) -> int | None:
     ]
     if limits:
         return min(limits)
-    if most := getattr(
-        env.unwrapped.spec, "max_episode_steps", None
-    ):  # some keep an MjSpec of that name
+    # Some keep an MjSpec by that name.
+    if most := getattr(env.unwrapped.spec, "max_episode_steps", None):
         return int(most)
     limit = getattr(getattr(env.unwrapped, "_env", None), "_step_limit", np.inf)  # of dm_control
     return int(limit) if np.isfinite(limit) else None

@@ -229,9 +229,8 @@ class Stage:
     def _lead(self, run: Played) -> None:
         """Plays a run from a reset that is led to its start, as its user would have it lead there."""
         (usual, led), how = (self._renewed(self._led) for _ in range(2)), self.spec.led
-        noted = how.noted(usual, led, run.start)
-        usual, led = self._renewed([usual]), self._renewed([led])
-        if noted:
+        if noted := how.noted(usual, led, run.start):
+            led = self._renewed([led])
             with how.to(led, run.start):
                 if not self.spec.wrapped:
                     led.reset()

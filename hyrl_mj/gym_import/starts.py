@@ -136,9 +136,8 @@ class Led:
         memory = led.memory()
         noted = [name for name in differing(memory, usual.memory()) if name not in before]
         # Where it draws other numbers, as until something is far enough away, all else is another draw.
-        if {*noted} & {*memory.generators} or usual.physics.depth(
-            usual.spec.solid
-        ) > usual.spec.depth:
+        deep = usual.physics.depth(usual.spec.solid) > usual.spec.depth
+        if deep or {*noted} & {*memory.generators}:
             return []
         return noted + [usual.physics.names[at] for at in moved]
 
@@ -162,8 +161,8 @@ def _check_led(spec: EnvironmentSpec) -> Led | None:
     rng, usual, led = np.random.default_rng(11), Instance(spec), Instance(spec)
     how, notes = Led(_homes(spec), _holders(Instance(spec))), False
     none = np.zeros((spec.max_steps, spec.dimension))
-    with how.to(led, spec.state):  # to where it leads anyway, which it can
-        led.reset()
+    with how.to(led, spec.state):
+        led.reset()  # to where it leads anyway: one that takes too long for a trial is refused
     for i, state in enumerate(_starts(spec, rng)):
         inputs = [usual.drawn(rng)] * spec.max_steps
         for farther in (0, FAR, -FAR) if i < EPISODES // 2 else (0,):

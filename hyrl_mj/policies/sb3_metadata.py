@@ -110,7 +110,8 @@ def check_original(about: Mapping[str, Any], task: Task) -> None:
     original = _observations(_decoded(about.get("_last_original_obs")), task)
     if sign := _wrapped((None, None), None, original, _Possible(task)):
         raise BadArtifact(
-            f"{sign}, before the given statistics come in; give a function that does in Python as both did"
+            f"{sign}, before the given statistics come in; give a function in Python that changes "
+            "observations as its training did, and asks the model"
         )
 
 

@@ -290,11 +290,8 @@ class Run:
     def is_examined_as_usual(self) -> bool:
         """Whether the examination on disk is under the run's own noise and from starts of all kinds."""
         found, own = self.robustness, self.settings
-        return (found.eps, found.everywhere, found.near_critical) == (
-            own.eps,
-            own.everywhere,
-            False,
-        )
+        alike = (found.eps, found.everywhere) == (own.eps, own.everywhere)
+        return alike and not found.near_critical
 
     @cached_property
     def versions(self) -> dict[str, str]:

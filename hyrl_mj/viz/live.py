@@ -141,10 +141,9 @@ class Page:
         task, bound = self.run.task, self.bound.value
         z0 = np.array([[slider.value for slider in self.start]])
         try:
+            # Others than the page may ask for anything.
             for control in (self.controller, self.mode, self.noise):
-                if (
-                    control.value not in control.options
-                ):  # others than the page may ask for anything
+                if control.value not in control.options:
                     raise unknown("choice", control.value, control.options)
             who, q0 = CONTROLLERS[self.controller.value], self._modes[self.mode.value]
             z0 = task.chart.check(z0, task.name)

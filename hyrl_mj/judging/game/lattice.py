@@ -128,8 +128,8 @@ class Lattice(Places):
             pairs = zip(grid.spacing, task.chart.units, strict=True)
             sides = " by ".join(f"{side:.3g} {unit}" for side, unit in pairs)
             return (
-                f"no sample moves {task.name} by a whole cell of the lattice ({sides}) along a coordinate, "
-                "and rounding would hold it in its place"
+                f"along some coordinate no sample moves {task.name} by a whole cell of the lattice "
+                f"({sides}), and rounding would hold it in its place there"
             )
         return None
 
