@@ -149,7 +149,12 @@ def instead(words: list[str]) -> bool:
                 name in (".", "hyrl-mj") and (not extra or extra in extras())
             ) or name == "pytest"
         case ["apt-get", "install", *packages]:  # root, network
-            assert f"apt_install {' '.join(packages)}" in setup
+            assert f'gl="{" ".join(packages)}"' in setup
+        case ["docker", "build", *_]:  # network
+            (libraries,) = re.findall('gl="(.*)"', setup)
+            assert libraries in (ROOT / "Dockerfile").read_text(encoding="utf-8")
+        case ["docker", "run", "--rm", "-v", _, "hyrl-mj", *rest]:  # in no container
+            call(rest)
         case ["tensorboard", "--logdir", folder]:  # serves for ever
             assert shutil.which("tensorboard", path=Path(sys.executable).parent)
             assert list(Path(folder).rglob("events.out.tfevents.*"))
