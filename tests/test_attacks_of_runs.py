@@ -107,7 +107,7 @@ def test_a_run_with_a_game_is_attacked_only_on_request(examined, monkeypatch):
 
 def test_a_run_whose_game_turns_out_to_decide_nothing_is_attacked(examined, monkeypatch):
     """As where starts are drawn otherwise than the game counts them, which the maps tell."""
-    run, game = load_run(examined), SimpleNamespace(estimate=True)
+    run, game = load_run(examined), SimpleNamespace(decides=False)
     monkeypatch.setattr(examination, "worst_case", lambda *_: (game, None))
     subject = subject_of(run, run.controllers, run.split)
     subject = replace(subject, playable=True, exact=True, effort=replace(SPARING, attack_starts=9))

@@ -660,6 +660,9 @@ def outlasting(old: Instance) -> list[str]:
     for one in (Instance(old.spec), Instance(old.spec), old):
         one.quit()
         one.reset(seed)
+        # Who goes on from episode to episode does not seed the space of actions, which may never have drawn.
+        if one._actions._np_random is None:
+            one._actions.seed(seed)
         remembered.append(one.remembered())
     new, twin, now = remembered
     # Names of files differ between any two, say, and the warm start tells nothing of where a run goes.

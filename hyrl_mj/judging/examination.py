@@ -146,7 +146,7 @@ def examine(
             task, points, subject.parts, subject.controllers, bounds, everywhere, subject.cells,
             subject.curves,
         )  # fmt: skip
-    decides = subject.exact and game is not None and not game.estimate
+    decides = subject.exact and game is not None and game.decides
     count = options.episodes
     if count is None and not decides:
         count = subject.effort.episodes

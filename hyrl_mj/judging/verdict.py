@@ -381,7 +381,10 @@ class _Case:
             theirs, _ = policy[kind]
             yield f"{when} HyRL arrives in {arrived:,} of {episodes:,} episodes, the policy in {theirs:,}"
         yield from self._attacked("hyrl", "policy")
-        if game := self.robustness.game:
+        game = self.robustness.game
+        if game and game.other_starts:
+            yield game.other_starts
+        elif game:
             policy_lost, lost = (1 - game.scores[who][-1].not_broken for who in NAMES)
             yield (
                 f"the worst-case game on nodes, here an estimate, finds noise that beats HyRL from "

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import fields, replace
 from functools import partial
 from typing import Any
 
@@ -84,13 +83,7 @@ def worst_case(
     fine = Game(task, parts, controllers, largest, everywhere, grid)
     certificate = Certificate.certify(fine, controllers)
     scores, maps = _scores(certificate, bounds)
-    if uncounted := _why_starts_are_others(certificate, maps):
-        why_not = dict.fromkeys(controllers, uncounted)
-        certificate = replace(certificate, cells=None, answers={}, why_not=why_not)
-        none: dict[str, Any] = dict.fromkeys(s.name for s in fields(Score) if "proved" in s.name)
-        scores = {name: tuple(replace(s, **none) for s in of) for name, of in scores.items()}
-        curves = False
-    replays = () if uncounted else _replays(certificate, scores)
+    replays = _replays(certificate, scores)
     if not curves:
         coarse, margins = fine, dict.fromkeys(controllers)
         curve, profile = _known(bounds, scores), Profile((), dict.fromkeys(scores, ()))
@@ -110,23 +103,27 @@ def worst_case(
     misses = _misses(coarse, controllers)
     result = GameResult(
         everywhere, lattice, scores, margins, proved, dict(certificate.why_not), misses, curve, profile,
-        replays, sensed,
+        replays, sensed, _why_starts_are_others(certificate, scores, maps),
     )  # fmt: skip
     return result, maps
 
 
-def _why_starts_are_others(certificate: Certificate, maps: Maps) -> str:
+def _why_starts_are_others(
+    certificate: Certificate, scores: Mapping[str, tuple[Score, ...]], maps: Maps
+) -> str:
     """Returns why shares of the start region are no shares of the starts that a task draws; "" if they are.
 
-    Scores count all of the region alike. A task may draw most of its starts where the last controller loses.
+    Scores count all of the region alike. A task may draw most of its starts where the last controller loses;
+    of one that wins too little for a good verdict that is not asked.
     """
     task, grid = certificate.game.task, certificate.game.lattice.grid
-    if type(task).starts is Task.starts or certificate.cells is None:
+    name, classes = [*maps.map.items()][-1]  # the hybrid controller
+    usual = type(task).starts is Task.starts
+    if usual or certificate.cells is None or scores[name][-1].not_broken < NEARLY:
         return ""
     rng, number = np.random.default_rng(0), 100_000
     even = rng.uniform(task.start_low, task.start_high, (number, task.chart.dimension))
     samples = task.starts(number, rng), even[task.may_start(even)]
-    name, classes = [*maps.map.items()][-1]  # of the hybrid controller
     proved = np.isin(classes, (MapClass.WON, MapClass.WON_FROM_SOME))
     for wins in (proved, proved | (classes == MapClass.UNCLEAR)):
         won = [wins[grid.nearest(z)] for z in samples]

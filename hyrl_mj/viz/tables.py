@@ -208,6 +208,8 @@ def score_table(task: Task, game: GameResult) -> Table:
         f"Nothing is proved of {'the RL policy' if who == 'policy' else NAMES[who]}, because {why}."
         for who, why in game.why_not_proved.items()
     ]
+    if game.other_starts:
+        remarks.append(f"Episodes decide, because {game.other_starts}.")
     title = f"{task.name}: worst case over all noise signals{estimated}"
     return Table.of(title, rows, caution * game.estimate + note, remarks)
 

@@ -213,6 +213,7 @@ class GameResult:
             controller; none of an estimate.
         sensed: what is proved of each controller under the task's own sensor, if that has a bias, or is late,
             and its game is not too large.
+        other_starts: why shares of the start region are none of the starts that a task draws; "" if they are.
     """
 
     everywhere: bool
@@ -226,6 +227,12 @@ class GameResult:
     profile: Profile
     replays: tuple[ReplayCount, ...] = ()
     sensed: dict[str, SensedScore] = field(default_factory=dict)
+    other_starts: str = ""
+
+    @property
+    def decides(self) -> bool:
+        """Whether it decides a verdict: it is no estimate, and counts the starts that the task draws."""
+        return not (self.estimate or self.other_starts)
 
     @property
     def estimate(self) -> bool:
@@ -300,8 +307,8 @@ class Robustness(artifacts.SavedAsJson):
 
     @property
     def deciding(self) -> GameResult | None:
-        """The game, if it is more than an estimate."""
-        return None if self.game is None or self.game.estimate else self.game
+        """The game, if it decides the verdict."""
+        return self.game if self.game and self.game.decides else None
 
     def check(self, controllers: Collection[str]) -> None:
         """Raises `BadArtifact` unless there are whole results of these controllers, as stages write them."""
