@@ -59,7 +59,7 @@ MISTAKES = {
     "a limit that is a float": ((PY, "max_steps = 70", "max_steps = 70.0"), "max_steps 70.0 cannot be"),
     "a limit of no samples": ((PY, "max_steps = 70", "max_steps = 0"), "integer from 1 to 100,000"),
     "a limit that is true": ((PY, "max_steps = 70", "max_steps = True"), "max_steps True cannot be"),
-    "endings in a column": ((PY, ENDED, "        return ends[:, None]\n"), r"ending\(\) .*shape \(64, 1\)"),
+    "endings in a column": ((PY, ENDED, "        return ends[:, None]\n"), r"ending\(\) .*shape \(\d+, 1\)"),
     "one ending for all": ((PY, ENDED, "        return Outcome.RUNNING\n"), r"ending\(\) .*a Outcome for"),
     "endings in a list": ((PY, ENDED, "        return list(ends)\n"), r"ending\(\) .*gives a list"),
     "no endings": ((PY, ENDED, "        ends = 0\n"), r"ending\(\) .*gives a NoneType"),
