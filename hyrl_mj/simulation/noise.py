@@ -364,7 +364,7 @@ def signal_for(noise: AnyNoise | None, task: Task, controller: Controller | None
     signal = noise.against(task, controller)
     for one in (signal, *signal.noises):
         limits, p = limits_of(one), len(task.noisy)
-        if limits.shape != (p,) or not ((limits >= 0) & np.isfinite(limits)).all():
+        if limits.shape != (p,) or not (limits >= 0).all():
             raise BadInput(
                 f"{one.kind} noise has {limits} as its largest magnitudes: give it a bound >= 0, and a share "
                 f"for each of the columns of the measurement, of which {task.name} has {p}"
