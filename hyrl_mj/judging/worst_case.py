@@ -38,7 +38,6 @@ from hyrl_mj.judging.proof.certificate import Certificate
 from hyrl_mj.judging.proof.counterexamples import Broken, beaten, find_counterexamples
 from hyrl_mj.judging.proof.replays import replay
 from hyrl_mj.judging.proof.sensed import prove_under
-from hyrl_mj.judging.sentences import NAMES
 from hyrl_mj.policies import BLAS, Controller
 from hyrl_mj.sets import GridSet
 from hyrl_mj.simulation import NOT_STARTED, LoopSettings, Sensor, closed_loop, covers_sensor
@@ -113,13 +112,14 @@ def _why_starts_are_others(
 ) -> str:
     """Returns why shares of the start region are no shares of the starts that a task draws; "" if they are.
 
-    Scores count all of the region alike. A task may draw most of its starts where the last controller loses;
-    of one that wins too little for a good verdict that is not asked.
+    Scores count all of the region alike. A task may draw most of its starts where the hybrid controller
+    loses; of one that wins too little for a good verdict that is not asked.
     """
     task, grid = certificate.game.task, certificate.game.lattice.grid
-    name, classes = [*maps.map.items()][-1]  # the hybrid controller
-    usual = type(task).starts is Task.starts
-    if usual or certificate.cells is None or scores[name][-1].not_broken < NEARLY:
+    classes, usual = maps.map.get("hyrl"), type(task).starts is Task.starts
+    if usual or classes is None or certificate.cells is None:
+        return ""
+    if scores["hyrl"][-1].not_broken < NEARLY:
         return ""
     rng, number = np.random.default_rng(0), 100_000
     even = rng.uniform(task.start_low, task.start_high, (number, task.chart.dimension))
@@ -131,8 +131,8 @@ def _why_starts_are_others(
         if most < NEARLY * least:  # by more than chance
             drawn, evenly = map(percent, map(share, won))
             return (
-                f"the game counts all starts of the box alike, of which {NAMES.get(name, name)} wins "
-                f"{evenly}, and starts() of {task.name} draws others, of which it wins {drawn}"
+                f"the game counts all starts of the box alike, of which HyRL wins {evenly}, and "
+                f"starts() of {task.name} draws others, of which it wins {drawn}"
             )
     return ""
 
