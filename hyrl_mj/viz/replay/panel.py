@@ -135,8 +135,9 @@ class Panel:
         height: int,
         camera: str,
         floors: marks.Floors | None = None,
+        beside: Sequence[Track] = (),  # of other panels, which show as much
     ):
-        self._tracks, self._camera = tracks, camera
+        self._tracks, self._beside, self._camera = tracks, beside, camera
         self._rests = mjcf.rests(task.model, mjcf.camera_of(task.model, camera))
         # A bar for each row, and all else in the scene, with room to spare.
         geoms = sum(len(track.arc.t) for track in tracks) + GEOMS * (1 + len(tracks))
@@ -157,8 +158,9 @@ class Panel:
         points = np.vstack([track.points for track in self._tracks])
         self._renderer.look(self._tracks[0].qpos(0.0), self._camera)
         middle = size / 2
-        if (np.abs(self._renderer.project(points)[0] - middle) > middle).any():
-            ends = self._renderer.extent(points, np.full(len(points), JUMP_RADIUS))
+        shown = np.vstack([points, *[track.points for track in self._beside]])
+        if (np.abs(self._renderer.project(shown)[0] - middle) > middle).any():
+            ends = self._renderer.extent(shown, np.full(len(shown), JUMP_RADIUS))
             beyond = np.abs(np.array(ends) - middle) / middle
             # Nothing shows what lies behind the camera.
             self._renderer.widening = float(beyond[np.isfinite(beyond)].max(initial=1.0))

@@ -98,7 +98,7 @@ class Screen:
                 panels.append(
                     Panel(
                         self._task, tracks, canvas, width, layout.scene_height, self._camera,
-                        self._floor,
+                        self._floor, self._tracks,
                     )
                 )  # fmt: skip
             drawn = -1.0
