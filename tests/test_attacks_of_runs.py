@@ -11,7 +11,8 @@ from test_report import Page, plant
 from test_verdict import ALL, EPS, HOLDS, enough, episodes
 
 import hyrl_mj
-from hyrl_mj import BadArtifact, BadInput, load_run
+from hyrl_mj import BadArtifact, BadInput, load_run, pipeline
+from hyrl_mj.cli import commands as of_commands
 from hyrl_mj.judging import examination
 from hyrl_mj.judging.game import AttackCount, Robustness, wilson
 from hyrl_mj.judging.verdict import Verdict, Word
@@ -139,6 +140,17 @@ def test_an_examination_near_the_critical_set_counts_for_no_other(copied):
     assert "--near-critical" in commands(load_run(copied), again)[-1]
     notes = [str(table.note) for table in robustness_tables(run.task, again)]
     assert any("All of the starts lie near the critical set." in note for note in notes)
+
+
+def test_near_the_critical_set_is_about_episodes_and_the_attack(examined, monkeypatch):
+    run, asked = load_run(examined), []
+    monkeypatch.setattr(Run, "exact", True)
+    monkeypatch.setattr(pipeline, "examine_run", lambda _, options: asked.append(options))
+    monkeypatch.setattr(of_commands, "print_robustness", lambda _: None)
+    with pytest.raises(BadInput, match="--near-critical is about the episodes: say how many"):
+        of_commands.robustness(run, ExamineOptions(near_critical=True))
+    of_commands.robustness(run, ExamineOptions(near_critical=True, attack_rounds=1))
+    assert [options.near_critical for options in asked] == [True]
 
 
 @pytest.mark.parametrize("options", [{"attack_rounds": -1}, {"attack_starts": 0}])

@@ -247,9 +247,11 @@ def robustness(run: Run, options: ExamineOptions) -> None:
 
     Writes robustness.json and the figures of a map and a curve, as PNG and PDF.
     """
-    if options.episodes is None and run.exact and (options.noise or options.near_critical):
-        option = "--noise" if options.noise else "--near-critical"
-        raise BadInput(f"{option} is about the episodes: say how many, as in --episodes 100000")
+    if options.episodes is None and run.exact:
+        attacked = options.budget(run.task.effort, run.exact) is not None
+        if options.noise or (options.near_critical and not attacked):
+            option = "--noise" if options.noise else "--near-critical"
+            raise BadInput(f"{option} is about the episodes: say how many, as in --episodes 100000")
     pipeline.examine_run(run, options)
     print_robustness(run.anew())
     if run.why_no_game is None:
