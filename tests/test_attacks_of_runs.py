@@ -201,8 +201,8 @@ def test_the_replay_plays_the_strongest_signals_from_one_start(examined):
     assert len(replay_shows(load_run(examined), noise="uniform")) == 2, "one for each mode"
 
 
-def test_the_replay_of_a_run_with_a_game_is_as_ever(examined, monkeypatch):
-    monkeypatch.setattr(Run, "why_no_game", None)
+def test_the_replay_of_a_run_whose_game_decides_is_as_ever(examined, monkeypatch):
+    monkeypatch.setattr(Robustness, "deciding", object())
     shows = replay_shows(load_run(examined))
     assert [show.policy[0].noise for show in shows] == ["alternating"] * 2
 

@@ -171,11 +171,12 @@ def replay_arcs(
 
 
 def attack_replay(run: Run) -> dict[str, HybridArc]:
-    """Returns the arcs that the replay of a run plays whose worst case cannot be computed.
+    """Returns the arcs that the replay of a run plays whose worst case is not decided by a game.
 
-    These are the strongest signals of the attack; {} if the run was not attacked, or has a game.
+    These are the strongest signals of the attack; {} if the run was not attacked, or its game decides.
     """
-    return {} if run.exact else run.attack_arcs()
+    arcs = run.attack_arcs()
+    return arcs if arcs and run.robustness.deciding is None else {}
 
 
 def overview_arcs(task: Task, policy: Policy) -> list[HybridArc]:
