@@ -299,19 +299,24 @@ def round_it(puck, side, clear=0.9):
 
 
 @pytest.mark.slow
-def test_episodes_tell_policies_apart_and_their_share_is_that_of_the_score(puck, puck_sets):
+def test_episodes_tell_policies_apart_and_their_share_is_that_of_the_score(
+    puck, puck_sets, monkeypatch
+):
     ground = by_episodes(puck, puck_sets, 0, batches=(8, 8))
-    wrong = ground(one_way_policy(puck, 1.0))
-    assert wrong[0] == 0, "it never comes back to the set-point"
-    assert len(lost_by(ground)) == round(-wrong[1] * 8) > 0
+    away = ground(never := one_way_policy(puck, 1.0))
+    assert away[0] == len(ground.plays) + 2, "it never comes back to the set-point, and ends well"
+    assert away[1] < -1
+    assert ground.suffices(never)
+    monkeypatch.setattr(puck, "precision", ground.allowed)
+    assert not by_episodes(puck, puck_sets, 0, batches=(8, 8)).suffices(never)
+    monkeypatch.undo()
     # As close as it gets without noise, but not with it.
     grazing = ground(close := round_it(puck, 1.0, clear=0.6))
     assert 0.0 < ground.won(close) < 1.0
     good = ground(wide := round_it(puck, 1.0))
     assert ground.won(wide) == 1.0
-    assert wrong < grazing < ground.enough <= good
+    assert grazing < away < ground.enough <= good
     assert grazing[0] == 3, "chance does not find it, the adversary does"
-    assert not len(lost_by(ground))
 
 
 @pytest.mark.slow
@@ -319,7 +324,7 @@ def test_a_policy_that_just_survives_the_noise_is_attacked_and_not_good_enough(p
     """Under somewhat more noise than the bound, 64 episodes of each kind find nothing, but an attack does."""
     narrowly, batches = round_it(puck, 1.0, clear=0.66), (64,)
     ground = by_episodes(puck, puck_sets, 0, batches=batches)
-    assert ground(narrowly) == (len(ground.plays), -1 / 64), "one start of 64 is lost"
+    assert ground(narrowly) == (len(ground.plays) + 1, -1 / 64), "one start of 64 is lost"
     assert not ground.suffices(narrowly)
     assert len(lost_by(ground)) == 1
     assert ground.won(narrowly) == 1 - 1 / 64
@@ -419,6 +424,28 @@ def test_the_image_of_a_policy_that_wins_all_is_judged_by_fewer_episodes(
     monkeypatch.setattr(ByEpisodes, "lost_under_attack", lost)
     assert ground.won_by_image(object(), won) == 1.0
     assert played == [*ground.plays[:plays], *["attack"] * attacks]
+
+
+@pytest.mark.slow
+def test_an_episode_that_no_policy_wins_hides_no_others(puck, puck_sets, monkeypatch):
+    """One of 32 is lost by all; two policies lose others, too, one of them more than a few."""
+    ground = by_episodes(puck, puck_sets, 1, batches=(32, 32), may_break=0.05)
+    others = {"best": (), "worse": (2,), "bad": (2, 3)}
+
+    def play(ground, policy, batch, kind):
+        won = np.ones(32, dtype=bool)
+        won[0] = False
+        won[[*others[policy]]] &= kind == "none" and batch == 0
+        return won, np.zeros(32)
+
+    monkeypatch.setattr(Episodes, "play", play)
+    best, worse, bad = map(ground, others)
+    assert ground.enough > best > worse > bad
+    assert best == (len(ground.plays), -1 / 32)
+    assert bad == (1, pytest.approx(-2 / 32))
+    assert not ground.suffices("best")
+    assert len(ground.judged("best").lost) == len(ground.plays)
+    assert ground.won("best") == 31 / 32
 
 
 @pytest.mark.slow

@@ -103,8 +103,9 @@ class ModeSettings(Checked):
         alike: how much less of its episodes a mirror image may win than the policy that it is the image of
             [share], where no policy is expected to win all.
         worth_attacking: a policy has to win this share without noise before it is attacked, which takes long.
-        may_break: a policy that loses no larger share than this is not trained: no training is expected to
-            do better.
+        may_break: a policy that loses no larger share than this under attack is not trained: no training is
+            expected to do better. Nor does it end how a policy is judged by noisy episodes: no policy may win
+            some of them.
     """
 
     lost_share: Annotated[float, _SHARE] = 0.2

@@ -349,18 +349,13 @@ class Episodes(ModeGround):
         self._plants = {n: task.plant(n) for n in set(sizes)}
 
     def play(self, policy: Policy, batch: int, kind: str) -> tuple[np.ndarray, np.ndarray]:
-        """Returns which episodes of a batch are won (k,), and how far off they end (k,).
-
-        Without noise they have to end at the set-point, under noise they have to survive.
-        """
+        """Returns which episodes of a batch are won (k,), as the task says, and how far off they end (k,)."""
         rows, task = self.batches[batch], self.task
         settings = LoopSettings(plant=self._plants[len(rows)], vary=True, quiet=True)
         noise, controller = Noise(kind, self.noise.bound), PolicyController(policy)
         starts, seed = self.begins[rows], int(rows[0])
         run = closed_loop(task, controller, starts, noise, seed=seed, settings=settings)
-        ends, won = run.path[-1], run.outcome == Outcome.REACHED
-        won = won & task.arrived(ends) if kind == game.NO_NOISE else won
-        return won, task.miss(ends)
+        return run.outcome == Outcome.REACHED, task.miss(run.path[-1])
 
     def share(self, policy: Policy, plays: Sequence[Play]) -> float:
         """Returns the share of the episodes of plays that a policy wins."""
@@ -374,11 +369,13 @@ class Episodes(ModeGround):
 class ByEpisodes(Episodes):
     """Judges by noisy episodes and an attack, where the worst case cannot be computed.
 
-    The score is the number of plays that stop no episode, then minus the share of episodes that the next play
-    stops; if none is stopped, minus the largest distance from the set-point at the end without noise, as a
-    multiple of `allowed`. The last play is the attack: a bias of its whole length is what few episodes draw.
-    The mirror image of a policy that wins all of its own mode has been judged there, so the first three
-    batches tell.
+    The score is the number of plays that stop few episodes (`may_break`) before one stops more, then minus
+    the mean share that these and that one stop: an episode that no policy wins hides no others. If none is
+    stopped an attack follows: a bias of its whole length is what few episodes draw. Then the score is minus the
+    share that it breaks, or if it breaks none, minus the largest distance from the set-point at the end
+    without noise, as a multiple of `allowed`. That is what a training aims at; for another one to follow a task
+    has to ask for a `precision`. The mirror image of a policy that wins all of its own mode has been judged
+    there, so the first three batches tell.
 
     What is reported comes from the attack of the examination: other starts, another seed, more rounds.
 
@@ -396,7 +393,7 @@ class ByEpisodes(Episodes):
         kinds = [kind for kind in self.kinds if kind != self.without]
         self.plays: list[Play] = [*product(range(self.count), kinds)]
         self.few_plays = self.plays[: 3 * len(kinds)]
-        self.enough = (len(self.plays) + 1.0, -1.0)
+        self.enough = (len(self.plays) + 2.0, -1.0)
         # As close as the stage-1 policy ends where it arrives, if it does.
         quiet = [self.play(policy, k, game.NO_NOISE) for k in range(self.count)] if policy else []
         ends = np.concatenate([np.empty(0), *(miss[won] for won, miss in quiet)])
@@ -431,29 +428,34 @@ class ByEpisodes(Episodes):
             return judged
         lost = self.lost_under_attack(policy)
         if lost.any():
-            return self._stopped(len(plays), lost, self.grid.nearest(self.attacked[lost]))
-        return replace(judged, score=(len(plays) + 1.0, judged.score[1]))
+            nodes = self.grid.nearest(self.attacked[lost])
+            return self._losing(len(plays) + 1, float(lost.mean()), nodes)
+        return judged
 
     def by_plays(self, policy: Policy, plays: Sequence[Play]) -> Judged:
-        """Judges a policy by plays alone."""
-        farthest = 0.0
+        """Judges a policy by plays alone, as if no attack broke it."""
+        farthest, shares, nodes = 0.0, [], []
         for survived, (batch, kind) in enumerate(plays):
             won, miss = self.play(policy, batch, kind)
             farthest = max(farthest, miss.max()) if kind == game.NO_NOISE else farthest
-            if not won.all():
-                return self._stopped(survived, ~won, self.lost_nodes(batch, won))
-        score = float(len(plays)), -farthest / self.allowed
-        return Judged(score, score[1] >= -1.0)
+            shares.append(float(np.mean(~won)))
+            nodes.append(self.lost_nodes(batch, won))
+            if shares[-1] > self.settings.may_break:
+                return self._losing(survived, float(np.mean(shares)), np.concatenate(nodes))
+        if any(shares):
+            return self._losing(len(plays), float(np.mean(shares)), np.concatenate(nodes))
+        score = len(plays) + 2.0, -farthest / self.allowed
+        return Judged(score, score[1] >= -1.0 or np.isinf(self.task.precision))
 
-    def _stopped(self, survived: int, lost: np.ndarray, nodes: np.ndarray) -> Judged:
-        """Returns that the play after those survived loses some of its starts (k,) bool, at nodes (l,)."""
-        return Judged((float(survived), -float(lost.mean())), False, nodes, np.ones(len(nodes)))
+    def _losing(self, survived: int, share: float, nodes: np.ndarray) -> Judged:
+        """Returns that a policy loses a share, at nodes (l,), after so many plays that stop few."""
+        return Judged((float(survived), -share), False, nodes, np.ones(len(nodes)))
 
     def won(self, policy: Policy) -> float:
         judged = self.judged(policy)
         if not len(judged.lost):
             return 1.0
-        if judged.score[0] == len(self.plays):  # it loses under the attack alone
+        if judged.score[0] == len(self.plays) + 1:  # it loses under the attack alone
             return 1.0 + judged.score[1]
         return self.share(policy, self.plays)
 
@@ -471,7 +473,7 @@ class ByAttack(ByEpisodes):
 
     def _prepare(self, policy: Policy | None) -> None:
         super()._prepare(policy)
-        self.enough = (1.0, float(len(self.plays)), -1.0)
+        self.enough = (1.0, *self.enough)
         self.nearly = (1 - self.settings.may_break,)
 
     def _attacked(self) -> np.ndarray:
