@@ -10,12 +10,6 @@ from hyrl_mj.simulation import LoopSettings, closed_loop
 from hyrl_mj.tasks import Outcome, Task, check_task
 
 
-def random_inputs(task: Task, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Returns inputs (n, m) drawn uniformly between the input limits."""
-    low, high = task.input_limits
-    return rng.uniform(low, high, (n, len(low)))
-
-
 def test_it_can_be_trained(task: Task) -> None:
     assert check_task(task) is task
 
@@ -28,10 +22,10 @@ def test_its_starts_lie_in_the_chart_and_repeat(task: Task) -> None:
 
 
 def test_an_episode_stays_finite_and_its_observations_in_their_space(task: Task) -> None:
-    rng, space, plant = np.random.default_rng(0), observation_space(task), task.plant(32)
-    plant.set_state(*task.state(task.starts(32, rng), rng))
+    rng, space = np.random.default_rng(0), observation_space(task)
+    plant = task.placed(task.starts(32, rng), rng)
     for _ in range(task.max_steps):
-        u = random_inputs(task, 32, rng)
+        u = task.draw_inputs(32, rng)
         plant.step(u)
         outcome = task.outcome(plant.measurement, plant.unstable)
         running = outcome == Outcome.RUNNING
@@ -48,15 +42,14 @@ def test_episodes_repeat_bit_for_bit_at_any_number_of_threads(task: Task, thread
         rng, plant = np.random.default_rng(5), task.plant(8, threads)
         plant.set_state(*task.state(task.starts(8, rng), rng))
         for _ in range(min(task.max_steps, 20)):
-            plant.step(random_inputs(task, 8, rng))
+            plant.step(task.draw_inputs(8, rng))
         return plant.state
 
     np.testing.assert_array_equal(episode(threads), episode(1))
 
 
 def test_what_the_plant_returns_is_not_its_memory(task: Task) -> None:
-    plant = task.plant(2)
-    plant.set_state(*task.state(task.starts(2, np.random.default_rng(0))))
+    plant = task.placed(task.starts(2, np.random.default_rng(0)))
     returned = [plant.measurement, plant.qpos, plant.state, task.z(plant.measurement)]
     kept = [values.copy() for values in returned]
     plant.step(np.tile(task.input_limits[1], (2, 1)))
@@ -71,8 +64,7 @@ def test_what_the_plant_returns_is_not_its_memory(task: Task) -> None:
 def test_chart_and_state_belong_together(task: Task) -> None:
     rng = np.random.default_rng(0)
     z, other = (task.chart.draw(100, rng) for _ in range(2))
-    plant = task.plant(100)
-    plant.set_state(*task.state(z))
+    plant = task.placed(z)
     np.testing.assert_allclose(task.z(plant.measurement), z, atol=1e-9)
     np.testing.assert_allclose(task.z(task.with_z(plant.measurement, other)), other, atol=1e-9)
 
@@ -82,9 +74,8 @@ def test_an_observation_leads_back_to_its_measurement(task: Task) -> None:
         with pytest.raises(BadInput, match="measured"):
             task.measured(np.zeros((1, len(task.observation_low))))
         return
-    rng, plant = np.random.default_rng(0), task.plant(500)
-    z = task.chart.draw(500, rng)
-    plant.set_state(*task.state(z, rng))
+    rng = np.random.default_rng(0)
+    plant = task.placed(task.chart.draw(500, rng), rng)
     seen = task.observation(plant.measurement).astype(np.float32).astype(float)
     measured = task.measured(seen)
     off = task.chart.difference(task.z(measured), task.z(plant.measurement))

@@ -14,7 +14,6 @@ from planted import euler, random_states
 from hyrl_mj.errors import BadInput
 from hyrl_mj.physics import mjcf
 from hyrl_mj.physics.plant import Plant
-from hyrl_mj.task_tests import random_inputs
 from hyrl_mj.tasks import get_task
 from hyrl_mj.tasks.vehicle import Vehicle
 
@@ -23,7 +22,7 @@ PAIRS = 2_000
 
 def test_one_sample_is_the_papers_equation_and_a_step_backward_inverts_it(task):
     rng = np.random.default_rng(1)
-    z, u = random_states(task, PAIRS, rng), random_inputs(task, PAIRS, rng)
+    z, u = random_states(task, PAIRS, rng), task.draw_inputs(PAIRS, rng)
     plant = task.plant(PAIRS)
     plant.set_state(task.state(z)[0])
     plant.step(u)
@@ -38,7 +37,7 @@ def test_whole_episodes_are_the_papers_equation(task):
     plant = task.plant(n)
     plant.set_state(task.state(z)[0])
     for _ in range({"unit_circle": 150, "vehicle": 60}[task.name]):
-        u = random_inputs(task, n, rng)
+        u = task.draw_inputs(n, rng)
         z = euler(task, z, u)
         plant.step(u)
         np.testing.assert_allclose(task.z(plant.measurement), z, rtol=0, atol=1e-6)
@@ -59,7 +58,7 @@ def test_the_number_of_threads_changes_no_bit(task):
         plant = task.plant(300, threads)
         plant.set_state(task.state(random_states(task, 300, rng))[0])
         for _ in range(20):
-            plant.step(random_inputs(task, 300, rng))
+            plant.step(task.draw_inputs(300, rng))
         states.append(plant.state)
     np.testing.assert_array_equal(*states)
 
@@ -305,7 +304,7 @@ def in_its_middle(task, threads):
     rng = np.random.default_rng(0)
     plant = task.plant(5, threads)
     plant.set_state(*task.state(task.starts(5, rng), rng))
-    inputs = [random_inputs(task, 5, rng) for _ in range(10)]
+    inputs = [task.draw_inputs(5, rng) for _ in range(10)]
     for u in inputs:
         plant.step(u)
     return plant, inputs

@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from functools import partial
 
 import numpy as np
 
 from hyrl_mj.errors import counted
 from hyrl_mj.judging.game import percent
 from hyrl_mj.runs.compared import Compared, Row
-from hyrl_mj.viz.tables import Table, print_table, spread
+from hyrl_mj.viz.tables import Table, number, print_table, spread, tried
 
-# The texts of numbers, and of shares that are not proved.
-_number, _tried = "{:.3g}".format, partial(percent, surely=False)
 # The figures in the table, with the headings of their columns and the texts of their values.
 COLUMNS: dict[str, tuple[str, Callable[[float], str]]] = {
-    "worst": ("won under attack", _tried),
-    "won": ("won in the game", _tried),
+    "worst": ("won under attack", tried),
+    "won": ("won in the game", tried),
     "proved": ("proved", percent),
     "lost_quiet": ("lost without noise", percent),
     "late": ("late", percent),
-    "miss": ("off the set-point", _number),
-    "variation": ("variation of inputs [1/s]", _number),
+    "miss": ("off the set-point", number),
+    "variation": ("variation of inputs [1/s]", number),
 }
 BRIEF = ("worst", "won", "lost_quiet", "late")
 
@@ -54,7 +51,7 @@ def result_table(compared: Compared, brief: bool = False) -> Table:
             row["setting"] = _settings(of)
         for figure, (heading, show) in COLUMNS.items():
             if (figure != "late" or compared.lasting) and (figure in BRIEF or not brief):
-                row[heading] = _cell(compared.values(name, figure), show, len(of))
+                row[heading] = spread(compared.values(name, figure), np.mean, show, len(of), "seed")
         if not brief:
             row["samples trained"] = f"{np.mean([r.samples for r in of]):,.0f}"
             row["seconds"] = f"{np.mean([r.seconds for r in of]):.0f}"
@@ -69,15 +66,6 @@ def _settings(rows: list[Row]) -> str:
     return "; ".join(sorted(dict.fromkeys(taken), key=taken.count, reverse=True))
 
 
-def _cell(values: list[float], show: Callable[[float], str], seeds: int = 0) -> str:
-    """Returns the mean of values, their range if they differ, and of how many seeds there is none."""
-    if not values:
-        return "-"
-    text = spread(float(np.mean(values)), (min(values), max(values)), show)
-    missing = seeds - len(values)
-    return f"{text}, none in {missing} of {counted(seeds, 'seed')}" if missing > 0 else text
-
-
 def tried_table(compared: Compared) -> Table | None:
     """Returns by which share of starts each setting was chosen; None if there was nothing to choose."""
     rows = []
@@ -87,7 +75,7 @@ def tried_table(compared: Compared) -> Table | None:
             won = [row.tried[label] for row in of if label in row.tried]
             chosen = sum(row.sentence == label for row in of)
             taken = f"{chosen} of {len(won)}"
-            rows.append([of[0].title, label, _cell(won, _tried), taken])
+            rows.append([of[0].title, label, spread(won, np.mean, tried), taken])
     headings = ("alternative", "setting", "won when it was chosen", "taken, seeds")
     note = (
         "The share of the winnable starts that each setting wins in the game, or of other starts under a "

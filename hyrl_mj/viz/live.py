@@ -10,6 +10,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from PIL.ImageColor import getrgb
 
 from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.runs.arcs import OF_RUNS, critical_starts, noisy_arcs
@@ -17,7 +18,7 @@ from hyrl_mj.runs.directory import Run
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import noise_kinds
 from hyrl_mj.system.progress import Say
-from hyrl_mj.viz.colours import BAD, CRITICAL, OVERLAP, rgba
+from hyrl_mj.viz.colours import BAD, CRITICAL, OVERLAP
 from hyrl_mj.viz.replay import marks
 from hyrl_mj.viz.replay.panel import Track
 from hyrl_mj.viz.section import Section
@@ -106,7 +107,7 @@ class Page:
             "start", 0.4, disable_rotations=True, active_axes=(True, True, False), position=at
         )
         self.handle.on_update(self._drag)
-        self._ghost = server.scene.add_icosphere("measured", 0.06, _rgb(BAD), opacity=0.4)
+        self._ghost = server.scene.add_icosphere("measured", 0.06, getrgb(BAD), opacity=0.4)
         self._label = server.scene.add_label("mode", "")
         self._simulate()
 
@@ -163,7 +164,7 @@ class Page:
         """Draws the way of an arc, in the colours of its modes."""
         points = np.add(track.points, (0.0, 0.0, marks.ON_TOP))
         if len(points) > 1:
-            colours = np.array([_rgb(track.colour(row)) for row in range(len(points) - 1)])
+            colours = np.array([getrgb(track.colour(row)) for row in range(len(points) - 1)])
             segments = np.stack([points[:-1], points[1:]], axis=1)
             pairs = np.repeat(colours[:, None], 2, axis=1)
             self.server.scene.add_line_segments(f"paths/{name}", segments, pairs, thickness=width)
@@ -173,12 +174,12 @@ class Page:
         floor = replay_floor(self.run).at(self._first)
         if len(floor.strips):
             self.server.scene.add_line_segments(
-                "overlap", floor.strips, _rgb(OVERLAP), thickness=float(floor.widths.mean())
+                "overlap", floor.strips, getrgb(OVERLAP), thickness=float(floor.widths.mean())
             )
         if len(floor.critical):
             above = np.add(floor.critical, (0.0, 0.0, marks.ON_TOP))
             self.server.scene.add_point_cloud(
-                "critical set", above, _rgb(CRITICAL), point_size=0.03, point_shape="circle"
+                "critical set", above, getrgb(CRITICAL), point_size=0.03, point_shape="circle"
             )
 
     @cached_property
@@ -206,8 +207,3 @@ class Page:
         """Draws what is random in the noise anew."""
         self._seed += 1
         self._changed.set()
-
-
-def _rgb(colour: str) -> tuple[int, int, int]:
-    red, green, blue = (round(255 * float(share)) for share in rgba(colour)[:3])
-    return red, green, blue

@@ -69,9 +69,7 @@ class Section:
 
     def failed(self, z: np.ndarray) -> np.ndarray:
         """Returns (n,) bool: whether a run ends without success at points (n, 2) of the plane."""
-        plant = self.task.plant(len(z))
-        plant.set_state(*self.task.state(self.lift(z)))
-        return self.task.failed(plant.measurement)
+        return self.task.failed(self.task.placed(self.lift(z)).measurement)
 
     @cached_property
     def over(self) -> GridSet | None:

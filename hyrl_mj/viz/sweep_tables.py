@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
-from hyrl_mj.errors import counted
 from hyrl_mj.judging.game import percent
 from hyrl_mj.runs.improvement import COMPARED, Mean, improvements
 from hyrl_mj.runs.sweeps import Row, Sweep
 from hyrl_mj.simulation import KINDS
-from hyrl_mj.viz.tables import NAMES, Table, print_table, spread
+from hyrl_mj.viz.tables import NAMES, Table, number, print_table, spread, tried
 
 
 @dataclass(frozen=True)
@@ -31,21 +29,19 @@ class Column:
     least: bool | None = None
 
 
-# The texts of numbers, and of shares that are not proved.
-_number, _tried = "{:.3g}".format, partial(percent, surely=False)
 # Figures that both controllers have: the heading, what that of HyRL ends with, and the text of a value.
 FIGURES: dict[str, tuple[str, str, Callable[[float], str]]] = {
     "proved": ("proved", ", own q0", percent),
-    "not_broken": ("not broken", ", own q0", _tried),
-    "margin": ("margin", "", _number),
+    "not_broken": ("not broken", ", own q0", tried),
+    "margin": ("margin", "", number),
     **{
         f"reached_{kind}": (f"arrives, {'no' if kind == 'none' else kind} noise", "", percent)
         for kind in KINDS
     },
-    "withstood_attack": ("not lost under attack", "", _tried),
+    "withstood_attack": ("not lost under attack", "", tried),
     "lost_without_noise": ("lost without noise", "", percent),
     "late": ("late", "", percent),
-    "longest": ("time relative to that without noise, 99%", "", _number),
+    "longest": ("time relative to that without noise, 99%", "", number),
 }
 
 
@@ -66,13 +62,13 @@ COLUMNS = {
     "winnable": Column("winnable starts", percent),
     **_both("proved", "not_broken"),
     "hyrl_proved_any": Column("HyRL proved, any q0", percent, True),
-    "hyrl_not_broken_any": Column("HyRL not broken, any q0", _tried, True),
+    "hyrl_not_broken_any": Column("HyRL not broken, any q0", tried, True),
     "limit_won_any": Column("limit, any q0", percent),
     **_both("margin"),
     "hyrl_proved_time": Column("latest arrival proved, own q0", "{:.2f} s".format),
     "hyrl_proved_time_any": Column("latest arrival proved, any q0", "{:.2f} s".format, False),
-    "hyrl_excursion": Column("excursion", _number),  # which is missing where each run ends
-    "hyrl_miss_without_noise": Column("HyRL off the set-point, no noise", _number, False),
+    "hyrl_excursion": Column("excursion", number),  # which is missing where each run ends
+    "hyrl_miss_without_noise": Column("HyRL off the set-point, no noise", number, False),
     **_both(*list(FIGURES)[3:]),
 }
 
@@ -92,8 +88,11 @@ def summary_table(sweep: Sweep) -> Table:
         ["verdicts", *(_verdicts(group) for group in done.values())],
     ]
     for name in shown(sweep.rows):
-        values = [[row.figures.get(name) for row in group] for group in done.values()]
-        rows.append([COLUMNS[name].heading, *(_cell(COLUMNS[name], own) for own in values)])
+        cells = [COLUMNS[name].heading]
+        for group in done.values():
+            known = [v for row in group if (v := row.figures.get(name)) is not None]
+            cells.append(spread(known, np.median, COLUMNS[name].show, len(group), "run"))
+        rows.append(cells)
     title = "median over the seeds (least to greatest where they differ)"
     return Table(title, ["figure", *(setting.title for setting in groups)], rows)
 
@@ -106,7 +105,7 @@ def improvement_table(sweep: Sweep) -> Table | None:
     rows = []
     for one in found:
         heading, own, show = FIGURES[one.figure]
-        signed = (lambda v: f"{v:+.3g}") if show is _number else (lambda v: f"{100 * v:+.2f}%")
+        signed = (lambda v: f"{v:+.3g}") if show is number else (lambda v: f"{100 * v:+.2f}%")
         row = {
             "figure": heading + own,
             "runs": f"{one.runs}",
@@ -171,13 +170,3 @@ def print_sweep(sweep: Sweep) -> None:
     for row in sweep.rows:
         if not row.done:
             print(f"{row.name}: {row.state}{f': {row.sentence}' if row.sentence else ''}")
-
-
-def _cell(column: Column, values: Sequence[float | None]) -> str:
-    """Returns median, least and greatest of some figures, and of how many runs there is none."""
-    known = [value for value in values if value is not None]
-    if not known:
-        return "-"
-    text = spread(float(np.median(known)), (min(known), max(known)), column.show)
-    missing = len(values) - len(known)
-    return f"{text}, none in {missing} of {counted(len(values), 'run')}" if missing else text

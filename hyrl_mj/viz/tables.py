@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,8 @@ from hyrl_mj.tasks import Task
 # With more modes than these, headings hold their numbers alone.
 NAMED = 2
 NAMES = {"policy": "RL policy", "hyrl": "HyRL", LIMIT: "limit"}
+# The texts of numbers, and of shares that are not proved.
+number, tried = "{:.3g}".format, partial(percent, surely=False)
 
 
 @dataclass(frozen=True)
@@ -77,10 +80,23 @@ def escaped(text: object) -> str:
     return re.sub(r"([\\|\[\]<>`])", r"\\\1", str(text))
 
 
-def spread(middle: float, ends: Iterable[float], show: Callable[[float], str]) -> str:
-    """Returns a middle value with the least and the greatest, if these differ: "3 (1 to 4)"."""
-    low, high = map(show, ends)
-    return show(middle) if low == high else f"{show(middle)} ({low} to {high})"
+def spread(
+    values: Sequence[float],
+    middle: Callable[[Sequence[float]], Any],
+    show: Callable[[float], str],
+    of: int = 0,
+    noun: str = "",
+) -> str:
+    """Returns the middle of values with the least and the greatest, if these differ: "3 (1 to 4)".
+
+    Of no values that is "-". `of` is how many there could be, of "run" or "seed".
+    """
+    if not values:
+        return "-"
+    low, high, text = show(min(values)), show(max(values)), show(float(middle(values)))
+    text = text if low == high else f"{text} ({low} to {high})"
+    missing = of - len(values)
+    return f"{text}, none in {missing} of {counted(of, noun)}" if missing > 0 else text
 
 
 Arcs = Mapping[tuple[str, str], HybridArc]

@@ -78,8 +78,7 @@ def vector_field(run: Run) -> Figure:
 
 def one_sample(task: Task, policy: Policy, z: np.ndarray) -> np.ndarray:
     """Returns how far (n, d) a policy moves the robot from chart points (n, d) in one sample."""
-    plant = task.plant(len(z))
-    plant.set_state(*task.state(z))
+    plant = task.placed(z)
     plant.step(policy.act(plant.measurement))
     return task.chart.difference(task.z(plant.measurement), z)
 
