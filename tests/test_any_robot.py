@@ -239,10 +239,8 @@ def test_a_new_task_is_written_into_a_folder(tmp_path):
         ("_", "letters, digits"),
         ("vehicle", "a task vehicle already"),
         ("numpy", "a Python package numpy already"),
-        (
-            "outcome",
-            "another use for the word Outcome",
-        ),  # its class would hide what the file imports
+        # Its class would hide what the file imports.
+        ("outcome", "another use for the word Outcome"),
         ("true", "another use for the word True"),
     ],
 )
@@ -253,8 +251,12 @@ def test_a_name_that_cannot_be_one_is_refused(tmp_path, name, says):
     assert not list(tmp_path.iterdir())
 
 
-def test_nothing_is_overwritten(tmp_path):
-    (tmp_path / "mine.xml").write_text("precious")
+@pytest.mark.parametrize("there", ["a file", "a link to nothing"])
+def test_nothing_is_overwritten(there, tmp_path):
+    if there == "a file":
+        (tmp_path / "mine.xml").write_text("precious")
+    else:
+        (tmp_path / "mine.xml").symlink_to(tmp_path / "elsewhere.xml")
     with pytest.raises(hyrl_mj.BadInput, match=r"mine\.xml exists already"):
         write_task("mine", tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["mine.xml"]

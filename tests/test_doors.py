@@ -109,15 +109,10 @@ def test_a_received_environment_runs_no_code_and_opens_no_file(env, given, tmp_p
     assert not trust.is_known(path)
 
 
-def test_an_environment_that_a_file_names_gets_no_task_of_another_file(tmp_path):
+def test_an_environment_runs_no_task_file_that_a_file_or_an_argument_names(tmp_path):
     path = code(tmp_path)
     with trust.received():
         assert "executes no file" in refusal(lambda: gym.make(CIRCLE, task=str(path)))
-    assert not (tmp_path / "executed").exists()
-
-
-def test_a_file_of_arguments_runs_no_task_file(tmp_path):
-    path = code(tmp_path)
     refusal(lambda: from_gymnasium(CIRCLE, kwargs={"task": str(path)}))
     assert not (tmp_path / "executed").exists()
 
@@ -213,12 +208,6 @@ def test_an_environment_of_a_hostile_model_is_one_sentence(tmp_path):
 
 
 @pytest.mark.slow
-def test_an_environment_that_never_ends_a_step_is_one_sentence():
-    sentence = refusal(lambda: from_gymnasium("Reacher-v5", kwargs={"frame_skip": 10**9}))
-    assert "takes longer than" in sentence
-
-
-@pytest.mark.slow
 def test_an_environment_that_this_process_registered_takes_arguments_also_arrays():
     def make(goal, **kwargs):
         assert isinstance(goal, np.ndarray)
@@ -243,9 +232,11 @@ def test_a_step_that_takes_long_is_one_sentence(monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_pinned_attribute_that_never_ends_a_step_is_one_sentence():
-    pinned = {"frame_skip": 2_000_000_000, "qpos[2]": 0.1, "qpos[3]": 0.1}
-    refusal(lambda: from_gymnasium("Reacher-v5", pinned=pinned, success="reward >= 1"))
+@pytest.mark.parametrize("what", ["kwargs", "pinned"])
+def test_an_environment_that_never_ends_a_step_is_one_sentence(what):
+    given = {"pinned": {"qpos[2]": 0.1, "qpos[3]": 0.1}, "kwargs": {}, "success": "reward >= 1"}
+    given[what] = given[what] | {"frame_skip": 2_000_000_000}
+    assert "takes longer than" in refusal(lambda: from_gymnasium("Reacher-v5", **given))
 
 
 def test_a_model_writes_no_warnings_into_the_current_folder(tmp_path, monkeypatch):
@@ -293,18 +284,9 @@ def test_nothing_is_imported_from_the_current_folder(words, tmp_path):
         code(tmp_path, f"{name}.py")
     with socket.create_server(("127.0.0.1", 0)) as listener:  # it answers, and is no cluster
         port = listener.getsockname()[1]
-        subprocess.run(
-            [
-                sys.executable,
-                "-P",
-                "-c",
-                folders.PROGRAM,
-                *(word.format(port=port) for word in words),
-            ],
-            cwd=tmp_path,
-            capture_output=True,
-            check=False,
-        )
+        program = [sys.executable, "-P", "-c", folders.PROGRAM]
+        words = [word.format(port=port) for word in words]
+        subprocess.run([*program, *words], cwd=tmp_path, capture_output=True, check=False)
     assert not (tmp_path / "executed").exists()
 
 
@@ -387,7 +369,7 @@ def test_a_long_sentence_is_cut_in_the_middle():
     text = str(BadInput(f"begin {'x' * 3_000_000} end"))
     assert text.startswith("begin x")
     assert text.endswith("x end")
-    assert len(text) <= LONGEST + 10
+    assert len(text) <= LONGEST + 10 >= len(str(BadInput("\U000e0001" * 500)))  # also with escapes
 
 
 def write(path, text):

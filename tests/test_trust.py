@@ -3,6 +3,8 @@
 import os
 import re
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,14 +14,14 @@ from command_line import call
 from planted import believe, without_pictures
 
 import hyrl_mj
-from hyrl_mj import BadArtifact, BadInput, HybridArc
+from hyrl_mj import BadArtifact, BadInput
 from hyrl_mj.files import artifacts, trust
 from hyrl_mj.files.manifest import check_contents
 from hyrl_mj.pipeline import run_stage
 from hyrl_mj.policies import algorithms
 from hyrl_mj.runs.directory import Run, write_config
 from hyrl_mj.sets import GridSet
-from hyrl_mj.tasks import described_task
+from hyrl_mj.tasks import described_task, write_task
 
 EVIL = "import pathlib\npathlib.Path({marker!r}).touch()\n"
 
@@ -97,8 +99,6 @@ def test_an_algorithm_that_a_run_names_is_not_imported(received, evil, marker):
 @pytest.fixture
 def robot(tmp_path):
     """A task file of the user's, which has not run yet."""
-    from hyrl_mj.tasks.scaffold import write_task
-
     return write_task("robot_of_mine", tmp_path)[0]
 
 
@@ -167,18 +167,10 @@ def test_a_run_of_somebody_else_s_robot_opens_when_its_file_is_named(received, r
 
 
 def python(code):
-    import subprocess
-    import sys
-
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
 
 
 # ---- what a stranger may try
-
-
-def test_a_file_without_a_record_is_not_even_read(tmp_path):
-    os.mkfifo(tmp_path / "endless.py")
-    assert not trust.is_known(tmp_path / "endless.py")
 
 
 def test_a_relative_place_for_records_is_ignored(monkeypatch):
@@ -192,35 +184,17 @@ def test_a_pipe_in_a_run_directory_is_refused(tmp_path):
         check_contents(tmp_path)
 
 
-@pytest.mark.parametrize("counts", [[0], [1], [2**40]])
-def test_a_grid_that_no_run_has_is_refused(counts, circle):
-    arrays = {"grid_counts": np.array(counts), "signed_distance": np.empty((10**12, 0))}
-    with pytest.raises(BadInput, match="cannot be used"):
-        GridSet.unpack(arrays, circle)
-
-
-def test_more_sets_than_there_are_modes_are_refused(circle):
-    arrays = {"grid_counts": np.array([2]), "signed_distance": np.zeros((5_000, 2))}
-    with pytest.raises(BadInput, match="5,000 sets"):
-        GridSet.unpack(arrays, circle)
-
-
 @pytest.mark.parametrize(
-    "change",
+    ("count", "sets", "message"),
     [
-        {"j": np.array(["\x1b[31m", "1"])},
-        {"j": np.array([0, 10**15])},
-        {"j": np.array([0.0, 1.0])},
-        {"t": np.array([0.1, 0.0])},
+        *((count, (10**12, 0), "cannot be used") for count in (0, 1, 2**40)),
+        (2, (5_000, 2), "5,000 sets"),
     ],
 )
-def test_an_arc_counts_its_jumps(change):
-    two = {"t": np.array([0.0, 0.1]), "j": np.array([0, 1]), "q": np.array([0, 1])}
-    table = dict.fromkeys(("z", "measured", "u", "state"), np.zeros((2, 1)))
-    words = {"task": "vehicle", "controller": "", "outcome": "", "noise": "none", "bound": 0.0}
-    HybridArc(**two, **table, **words)
-    with pytest.raises(BadInput, match="make no arc"):
-        HybridArc(**{**two, **change}, **table, **words)
+def test_sets_that_no_run_has_are_refused(count, sets, message, circle):
+    arrays = {"grid_counts": np.array([count]), "signed_distance": np.zeros(sets)}
+    with pytest.raises(BadInput, match=message):
+        GridSet.unpack(arrays, circle)
 
 
 def _lost(content):
