@@ -1,7 +1,9 @@
-"""The command line, called in this process: a process of its own would import everything again."""
+"""The command line, called in this process: one of its own would import everything again; and other code."""
 
 import contextlib
 import io
+import subprocess
+import sys
 from pathlib import Path
 from typing import NamedTuple
 
@@ -32,3 +34,11 @@ def call(*words, cwd="."):
     ):
         status = Streams().run(lambda: dispatch([*map(str, words)]))
     return Answer(status, out.getvalue(), err.getvalue())
+
+
+def python(code, *words, **options):
+    """Run code in a process of its own, with words in `sys.argv`, and options of `subprocess.run`."""
+    command = [sys.executable, "-c", code, *map(str, words)]
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=90, check=False, **options
+    )

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from command_line import call, contents
+from command_line import call, contents, python
 from gl import needs_gl
 from PIL import Image
 from planted import played_before
@@ -343,7 +343,7 @@ for mode in run.controller.modes:
 arc = hyrl_mj.simulate(run.task, run.controller, [3.0], hyrl_mj.Noise("alternating", 0.1), q0=1)
 print(arc.outcome)
 """
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    done = python(program)
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() in ("reached", "stalled")
 

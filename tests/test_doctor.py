@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import imageio_ffmpeg
 import pytest
+from command_line import python
 from gl import needs_gl
 
 import hyrl_mj
@@ -28,8 +26,7 @@ def test_versions_without_importing():
         "print(*lines, sep='\\n'); print('missing:', missing);"
         "print('imported:', {'torch', 'stable_baselines3', 'mediapy', 'matplotlib'} & set(sys.modules))"
     )
-    child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    *lines, missing, imported = child.stdout.splitlines()
+    *lines, missing, imported = python(code).stdout.splitlines()
     assert missing == "missing: []"
     assert imported == "imported: set()"
     assert [line.split()[0] for line in lines] == ["python", *doctor.DISTRIBUTIONS]

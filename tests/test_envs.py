@@ -13,6 +13,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+from command_line import python
 from gl import needs_gl
 from gymnasium.utils.env_checker import check_env as gymnasium_check
 from stable_baselines3.common.env_checker import check_env as sb3_check
@@ -531,10 +532,8 @@ print(env.render().shape)
     ("when", "says"), [("before", "(480, 640, 3)"), ("after", "was forked from")]
 )
 def test_a_forked_process_draws_or_says_why_not(when, says):
-    done = subprocess.run(
-        [sys.executable, "-c", FORKED, when], capture_output=True, text=True, timeout=90, check=False,
-        env={**os.environ, "PYTHONPATH": str(Path(hyrl_mj.__file__).parents[1])},
-    )  # fmt: skip
+    path = str(Path(hyrl_mj.__file__).parents[1])
+    done = python(FORKED, when, env={**os.environ, "PYTHONPATH": path})
     first, *rest = done.stdout.splitlines()
     assert says in first, done.stderr
     assert rest == ["ended with 0", "(480, 640, 3)"], done.stderr

@@ -2,7 +2,6 @@
 
 import copy
 import re
-import subprocess
 import sys
 import threading
 import time
@@ -16,6 +15,7 @@ from types import ModuleType
 import numpy as np
 import onnxruntime
 import pytest
+from command_line import python
 from numpy import empty
 from planted import AnalyticSet, Cube, Hall, ideal_controller, random_states
 from scipy import special
@@ -268,14 +268,7 @@ def test_the_folder_needs_numpy_alone(vehicle, tmp_path):
     written = export_numpy(controller, tmp_path / "folder")
     measured = random_states(vehicle, 50, RNG(0))
     np.save(tmp_path / "folder" / "measured.npy", measured)
-    done = subprocess.run(
-        [sys.executable, "-c", ALONE],
-        cwd=tmp_path / "folder",
-        env={},
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    done = python(ALONE, cwd=tmp_path / "folder", env={})
     assert done.returncode == 0, done.stderr
     imports = re.findall(r"^[ \t]*(?:from|import) .*", written[0].read_text(), re.MULTILINE)
     assert imports == ["import numpy as np"]

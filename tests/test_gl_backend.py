@@ -1,11 +1,10 @@
 """Which GL backend MuJoCo is imported with, and what is left of one that does not go."""
 
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from command_line import python
 
 from hyrl_mj.system import gl
 
@@ -28,6 +27,12 @@ if backend not in os.environ["GOOD"].split(","):
 OPENGL = "import os; platform = os.environ.get('PYOPENGL_PLATFORM', 'its own choice')"
 
 
+def in_process(code, environment):
+    """Runs code in a process of its own, of whose environment nothing else speaks of GL."""
+    kept = {name: value for name, value in os.environ.items() if name not in HIDDEN}
+    return python(code, env=kept | environment)
+
+
 @pytest.fixture
 def ask(tmp_path):
     """A function that imports the module in a process of its own, and tells what it prints after that."""
@@ -42,14 +47,8 @@ def ask(tmp_path):
     )
 
     def run(code, good, before="", **environment):
-        kept = {name: value for name, value in os.environ.items() if name not in HIDDEN}
-        return subprocess.run(
-            [sys.executable, "-c", f"{load}{before}\nspec.loader.exec_module(gl)\n{code}"],
-            env=kept | {"PYTHONPATH": str(tmp_path), "GOOD": good} | environment,
-            capture_output=True,
-            text=True,
-            timeout=60,
-        )
+        environment = {"PYTHONPATH": str(tmp_path), "GOOD": good} | environment
+        return in_process(f"{load}{before}\nspec.loader.exec_module(gl)\n{code}", environment)
 
     return run
 
@@ -117,14 +116,8 @@ def test_with_a_display_the_choice_is_mujoco_s_and_so_is_the_error(ask):
     ("environment", "said"), [({}, "egl"), ({"MUJOCO_GL": "disabled"}, "disabled")]
 )
 def test_the_real_mujoco_gets_a_backend_only_where_the_user_has_named_none(environment, said):
-    kept = {name: value for name, value in os.environ.items() if name not in HIDDEN}
-    child = subprocess.run(
-        [sys.executable, "-c", "import hyrl_mj, os; print(os.environ.get('MUJOCO_GL'))"],
-        env=kept | {"PYTHONPATH": str(Path(gl.__file__).parents[1])} | environment,
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    environment = {"PYTHONPATH": str(Path(gl.__file__).parents[1])} | environment
+    child = in_process("import hyrl_mj, os; print(os.environ.get('MUJOCO_GL'))", environment)
     assert child.stdout.strip() == said, child.stderr
 
 

@@ -25,7 +25,7 @@ import numpy as np
 import pytest
 from attacks import MARKER, child, crafted_agents, forgery
 from attacks.folders import plant_modules
-from command_line import call
+from command_line import call, python
 from environments import Puck
 from PIL import Image
 
@@ -88,10 +88,7 @@ def test_the_folder_of_another_process_that_is_at_work_stays(tmp_path, monkeypat
         monkeypatch.setattr(Path, "exists", lambda path: False)  # as it was a moment before
         code = "import sys; from pathlib import Path; from hyrl_mj.files.manifest import locked\n"
         code += "Path.exists = lambda path: False\nwith locked(Path(sys.argv[1])): pass"
-        done = subprocess.run(
-            [sys.executable, "-P", "-c", code, folder], capture_output=True, text=True
-        )
-        assert "another process is working" in done.stderr
+        assert "another process is working" in python(code, folder).stderr
         assert os.listdir(folder) == [".lock"]
 
 
@@ -213,10 +210,7 @@ def test_a_session_in_a_folder_of_a_stranger_takes_no_package_from_it(tmp_path):
             except BadInput:
                 print("refused")
     """
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
-    )
-    assert done.stdout == "refused\n" * 2
+    assert python(code, cwd=tmp_path).stdout == "refused\n" * 2
     assert not (tmp_path / "executed").exists()
 
 
@@ -358,11 +352,7 @@ def test_a_matplotlibrc_of_the_current_folder_has_no_part(tmp_path):
         "from hyrl_mj.viz.figures import style; import matplotlib; print(matplotlib.get_backend())"
     )
     os.mkfifo(tmp_path / "matplotlibrc")  # who reads it waits for ever
-    done = subprocess.run(
-        [sys.executable, "-P", "-c", code],
-        cwd=tmp_path, env=os.environ | {"MPLBACKEND": "nonsense"}, timeout=60,
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
+    done = python(code, cwd=tmp_path, env=os.environ | {"MPLBACKEND": "nonsense"})
     assert (done.stdout, done.stderr) == ("agg\n", "")
 
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 from itertools import pairwise
 
 import mujoco
 import numpy as np
 import pytest
+from command_line import python
 from gl import needs_gl
 
 from hyrl_mj import BadInput
@@ -177,14 +176,7 @@ def test_without_gl_one_message_says_what_to_install(backend):
         "try: SceneRenderer(hyrl_mj.get_task('vehicle').model, 64, 48)\n"
         "except hyrl_mj.NoRenderer as error: print(error)\n"
     )
-    child = subprocess.run(
-        [sys.executable, "-c", code],
-        env={**os.environ, "MUJOCO_GL": backend},
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=60,
-    )
+    child = python(code, env={**os.environ, "MUJOCO_GL": backend})
     assert f"MUJOCO_GL='{backend}'" in child.stdout
     assert "apt-get install libegl1 libopengl0 libgl1-mesa-dri" in child.stdout
     assert child.stdout.count("\n") == 1
@@ -201,13 +193,7 @@ def test_who_imports_mujoco_first_gets_pictures_too():
         "print(renderer.draw().std() > 5)\n"
     )
     hidden = ("MUJOCO_GL", "PYOPENGL_PLATFORM")
-    child = subprocess.run(
-        [sys.executable, "-c", code],
-        env={k: v for k, v in os.environ.items() if k not in hidden},
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    child = python(code, env={k: v for k, v in os.environ.items() if k not in hidden})
     assert child.stdout == "True\n", child.stderr
 
 

@@ -4,13 +4,12 @@ import-linter: see its contract in pyproject.toml.
 
 import importlib
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import grimp
 import numpy as np
 import pytest
+from command_line import python
 from planted import random_states
 
 import hyrl_mj
@@ -56,11 +55,8 @@ sys.meta_path.insert(0, Refuse())
 
 def run_without(blocked, code, **environment):
     """Run code in a fresh interpreter where importing some packages raises."""
-    result = subprocess.run(
-        [sys.executable, "-c", BLOCKED.format(blocked=set(blocked)) + code],
-        capture_output=True, text=True, timeout=60,
-        env={**os.environ, "PYTHONPATH": str(PACKAGE.parent), **environment},
-    )  # fmt: skip
+    environment = {**os.environ, "PYTHONPATH": str(PACKAGE.parent), **environment}
+    result = python(BLOCKED.format(blocked=set(blocked)) + code, env=environment)
     assert result.returncode == 0, result.stderr
     return result.stdout
 

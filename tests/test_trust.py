@@ -3,14 +3,12 @@
 import os
 import re
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import call
+from command_line import call, python
 from planted import believe, without_pictures
 
 import hyrl_mj
@@ -164,10 +162,6 @@ def test_a_run_of_somebody_else_s_robot_opens_when_its_file_is_named(received, r
     assert other.returncode == 2, "its policies are for another robot"
     assert "a grid of 2,880 cells" in other.stderr, "cells of a circle are too many for a plane"
     assert other.stderr.count("\n") == 1
-
-
-def python(code):
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
 
 
 # ---- what a stranger may try
