@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_certificate import linear
 from test_checks import PY as PYTHON, XML, changed
-from test_truer_tasks import PY, write
+from test_truer_tasks import FLIPPED, PY, write
 from trapped_plants import dial, task_of
 
 from hyrl_mj import BadInput, HybridController, Noise, get_task, simulate
@@ -142,54 +142,59 @@ def test_small_numbers_of_half_precision_are_rounded_more():
 # ---- task files
 
 
-@pytest.mark.parametrize(
-    "own",
-    [
-        "dt = 0.1",
-        "obstacles = {}",
-        "def failed(self, measured):\n        return measured[:, 0] > 1",
-        "def noise_in_chart(self, bound, everywhere=False):\n        return np.zeros(2)",
-    ],
-)
-def test_a_name_that_the_package_computes_is_refused(own, tmp_path):
-    name = own.removeprefix("def ").split("(")[0].split(" ")[0]
-    task = get_task(write(tmp_path, {"methods": f"    {own}\n"}))
-    with pytest.raises(BadInput, match=f"it defines {name}, which hyrl_mj computes"):
-        check_task(task)
+def method(head, answer):
+    return {"methods": f"    def {head}:\n        return {answer}\n"}
+
+
+OTHER_ORDER = {
+    "methods": FLIPPED + method("measure(self, sensors)", "sensors[:, ::-1]")["methods"],
+    "ending": PY["ending"].replace("x, y =", "y, x ="),
+}
 
 
 @pytest.mark.parametrize(
-    ("parts", "message"),
+    ("own", "message"),
     [
+        ({"methods": "    dt = 0.1\n"}, "it defines dt, which hyrl_mj computes"),
+        ({"methods": "    obstacles = {}\n"}, "it defines obstacles, which hyrl_mj computes"),
+        (method("failed(self, measured)", "measured[:, 0] > 1"), "defines failed, which hyrl_mj"),
+        (method("noise_in_chart(self, *given)", "np.zeros(2)"), "defines noise_in_chart, which"),
         (
-            {"methods": "    def with_z(self, measured, z):\n        return measured\n"},
-            r"with_z\(\) and z\(\) do not belong to each other",
+            {"methods": "    sensors = 'uniform 0.1'\n"},
+            "defines sensors, which nothing uses: if sensor is meant",
         ),
+        (method("verdicts(self, m)", "0 * m[:, 0]"), "if verdict is meant"),
+        (method("with_z(self, measured, z)", "measured"), r"with_z\(\) and z\(\) do not belong"),
         (
             {"measured": "observation * 2"},
             r"measured\(\) is not the inverse of observation\(\): observation\[",
         ),
+        (OTHER_ORDER, "moves the chart's x by 1, and its share in noisy is 0"),
+        (
+            method("starts(self, n, rng)", "np.random.uniform(0, [0.4, 1], (n, 2))"),
+            "draws other starts from a generator of the same seed",
+        ),
     ],
 )
-def test_methods_that_belong_together_are_compared(parts, message, tmp_path):
+def test_methods_that_are_not_what_they_seem_are_refused(own, message, tmp_path):
     with pytest.raises(BadInput, match=message):
-        check_task(get_task(write(tmp_path, parts)))
+        check_task(get_task(write(tmp_path, own)))
 
 
-def test_noise_of_columns_in_another_order_than_the_chart_is_refused(tmp_path):
-    methods = """
-    def measure(self, sensors):
-        return sensors[:, ::-1]
-
-    def z(self, measured):
-        return measured[:, ::-1]
-
-    def with_z(self, measured, z):
-        return z[:, ::-1]
-"""
-    ending = PY["ending"].replace("x, y =", "y, x =")
-    path = write(tmp_path, {"methods": methods, "ending": ending})
-    with pytest.raises(BadInput, match="moves the chart's x by 1, and its share in noisy is 0"):
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('"sample_time"', '"sampletime"', "the numeric sampletime .* is called sample_time"),
+        (
+            ' joint="x"/>',
+            ' joint="x" noise="0.05"/>',
+            r"has noise=0\.05, which MuJoCo adds nowhere",
+        ),
+    ],
+)
+def test_what_mujoco_does_not_use_is_refused(old, new, message, tmp_path):
+    path = write(tmp_path, text=lambda xml: xml.replace(old, new))
+    with pytest.raises(BadInput, match=message):
         check_task(get_task(path))
 
 
