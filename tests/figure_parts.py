@@ -5,6 +5,7 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 from planted import (
     decisions,
+    extended,
     halves,
     homing_controller,
     homing_policy,
@@ -12,7 +13,7 @@ from planted import (
     sign_policy,
 )
 
-from hyrl_mj import ExtendedSets, Noise, simulate
+from hyrl_mj import Noise, simulate
 from hyrl_mj.runs.arcs import overview_arcs, policy_start_arcs
 from hyrl_mj.viz.figures import ShownRun, style
 from hyrl_mj.viz.section import Section
@@ -53,10 +54,7 @@ def controller_of(task):
 def sets_of(task, reach=0.2):
     """Returns the parts, each extended over M* by the noise bound `reach`."""
     parts = halves(task).parts
-    sets = tuple(part.dilated_by_box(task.noise_in_chart(reach)) for part in parts)
-    everywhere = np.ones(len(sets[0].values), dtype=bool)
-    nowhere = np.empty((0, task.chart.dimension)), np.empty(0)
-    return ExtendedSets((0, 1), sets, (everywhere,) * 2, 0.25, EPS, *nowhere)
+    return extended([part.dilated_by_box(task.noise_in_chart(reach)) for part in parts])
 
 
 def arcs_of(task):

@@ -25,6 +25,7 @@ from hyrl_mj.runs.directory import load_run
 from hyrl_mj.sets import Chart, Grid, GridSet
 from hyrl_mj.stages import grounds
 from hyrl_mj.stages.critical_set import CriticalSet
+from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.partition import Partition
 from hyrl_mj.tasks import Learning, Outcome, Scene, Task, trial
 from hyrl_mj.viz import diagnosis, section
@@ -215,6 +216,22 @@ def decisions(task):
     on_axis = np.stack([np.linspace(0, 0.4, 9), np.zeros(9)], axis=-1)
     points = np.array([[np.pi]]) if task.name == "unit_circle" else on_axis
     return CriticalSet(points, np.zeros(len(points), dtype=int), resolution=0.01, spacing=0.05)
+
+
+def extended(sets, winning=None, horizon=0.3, eps=0.1):
+    """Extended sets of modes 0, 1, ... that meet nowhere; `winning` is (N,) bool of each mode, or all win."""
+    grid = sets[0].grid
+    winning = winning or [np.ones(grid.size, dtype=bool) for _ in sets]
+    nowhere = np.empty((0, grid.chart.dimension)), np.empty(0)
+    modes = tuple(range(len(sets)))
+    return ExtendedSets(modes, tuple(sets), tuple(winning), horizon, eps, *nowhere)
+
+
+def flow_sets(controller, cells):
+    """The flow sets of a controller, at the nodes of a grid."""
+    grid = Grid.with_cells(controller.task.chart, cells)
+    flows = [controller.flow_set(q) for q in controller.modes]
+    return [GridSet(grid, flow.signed_distance(grid.nodes)) for flow in flows]
 
 
 # ---- unit circle

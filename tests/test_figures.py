@@ -25,13 +25,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Wedge
 from matplotlib.path import Path as Outline
 from matplotlib.quiver import Quiver
-from planted import Cube, decisions, plane_policy, without_pictures
+from planted import Cube, decisions, extended, plane_policy, without_pictures
 
 import hyrl_mj
 from hyrl_mj import BadInput, HybridController, Outcome, Scene, simulate
 from hyrl_mj.runs.arcs import overview_arcs, policy_start_arcs
 from hyrl_mj.sets import Everything, Grid, GridSet
-from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.partition import Partition
 from hyrl_mj.viz import colours, figures
 from hyrl_mj.viz.figures import charts, runs, style
@@ -401,7 +400,7 @@ def test_of_three_dimensions_a_section_is_drawn_and_the_runs_over_time():
         noisy=arcs["start0", "policy"],
         noiseless=tuple(overview_arcs(cube, policy)),
         paper=tuple(policy_start_arcs(cube, policy, EPS, 0)),
-        sets=ExtendedSets((0, 1), (half, ~half), (), 0.3, EPS, np.empty((0, 2)), np.empty(0)),
+        sets=extended([half, ~half]),
         replays=arcs,
     )
     assert figures.names(cube, figures.ShownRun) == NAMES

@@ -13,14 +13,13 @@ import numpy as np
 import pytest
 from gl import needs_gl
 from PIL import Image, ImageColor
-from planted import circle_controller, circle_policy, decisions, halves
+from planted import circle_controller, circle_policy, decisions, extended, flow_sets, halves
 
 import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, HybridArc, HybridController, Noise, NoRenderer
 from hyrl_mj.physics.mjcf import models_dir
 from hyrl_mj.physics.rendering import Canvas
 from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.viz import ReplayOptions
 from hyrl_mj.viz.colours import BAD, CRITICAL, GOOD, MODES, OPEN, OVERLAP, POLICY, WHITE
 from hyrl_mj.viz.replay import Show, render_replay
@@ -293,12 +292,8 @@ def test_a_mark_is_no_geom_of_the_model_that_was_drawn_in_its_place():
 @needs_gl
 def test_critical_set_and_overlap_lie_on_the_floor(jump):
     grid = Grid.with_cells(TASK.chart, 120)
-    x, y = grid.nodes.T
-    sets = tuple(GridSet(grid, side * y - 0.2) for side in (-1, 1))
-    won = np.ones(len(x), dtype=bool)
-    none = (np.empty((0, 2)), np.empty(0))
-    extended = ExtendedSets((0, 1), sets, (won, won), 0.3, 0.1, *none)
-    floor = Floor.from_sets(Section(TASK), decisions(TASK), halves(TASK, 120), extended)
+    sets = [GridSet(grid, side * grid.nodes[:, 1] - 0.2) for side in (-1, 1)]
+    floor = Floor.from_sets(Section(TASK), decisions(TASK), halves(TASK, 120), extended(sets))
     floors = Floors(TASK.chart, None, (floor,))
     picture, pixel = drawn([Track(TASK, jump)], 0.0, size=(640, 640), floor=floors)
     plain, _ = drawn([Track(TASK, jump)], 0.0, size=(640, 640))
@@ -316,12 +311,8 @@ def test_critical_set_and_overlap_lie_on_the_floor(jump):
 
 
 def test_the_overlap_of_the_circle_is_around_its_critical_point(circle):
-    grid = Grid.with_cells(circle.chart, 600)
-    controller = circle_controller(circle, overlap=0.4)
-    sets = tuple(GridSet(grid, controller.flow_set(q).signed_distance(grid.nodes)) for q in (0, 1))
-    won = np.ones(len(grid.nodes), dtype=bool)
-    extended = ExtendedSets((0, 1), sets, (won, won), 0.5, 0.1, np.empty((0, 1)), np.empty(0))
-    floor = Floor.from_sets(Section(circle), decisions(circle), halves(circle, 600), extended)
+    sets = extended(flow_sets(circle_controller(circle, overlap=0.4), 600))
+    floor = Floor.from_sets(Section(circle), decisions(circle), halves(circle, 600), sets)
     angles = np.arctan2(floor.strips[..., 1], -floor.strips[..., 0])
     assert np.abs(angles).max() == pytest.approx(0.4, abs=0.011)
     lengths = np.linalg.norm(floor.strips[:, 0] - floor.strips[:, 1], axis=1)
@@ -342,9 +333,8 @@ def test_of_discs_that_lie_on_each_other_one_is_drawn():
 
 def test_the_set_of_one_mode_overlaps_with_nothing():
     grid = Grid.with_cells(TASK.chart, 120)
-    whole, won = GridSet(grid, np.full(len(grid.nodes), -1.0)), np.ones(len(grid.nodes), dtype=bool)
-    extended = ExtendedSets((1,), (whole,), (won,), 0.3, 0.1, np.empty((0, 2)), np.empty(0))
-    floor = Floor.from_sets(Section(TASK), decisions(TASK), halves(TASK, 120), extended)
+    sets = extended([GridSet(grid, np.full(len(grid.nodes), -1.0))])
+    floor = Floor.from_sets(Section(TASK), decisions(TASK), halves(TASK, 120), sets)
     assert len(floor.strips) == 0
     assert len(floor.critical) > 0
 

@@ -18,7 +18,7 @@ import pytest
 from browser import chromium, needs_chromium
 from command_line import contents
 from PIL import Image
-from planted import Cube, believe, decisions, halves, without_pdfs, without_pictures
+from planted import Cube, believe, decisions, extended, halves, without_pdfs, without_pictures
 
 from hyrl_mj import BadArtifact, BadInput, MlpPolicy, load_run
 from hyrl_mj.files.artifacts import replacing, write_json
@@ -29,7 +29,6 @@ from hyrl_mj.policies import Agent
 from hyrl_mj.runs.directory import Run, write_config
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages.critical_set import CriticalSet
-from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.partition import Partition
 from hyrl_mj.tasks import Scene, registry
 from hyrl_mj.viz import tables
@@ -76,14 +75,9 @@ def plant(path, task, critical, partition, slack=0.2, **settings):
         critical.save(path / "critical_set.npz")
     with run.manifest.stage("partition"):
         partition.save(path / "partition.npz")
-    grid = partition.grid
     with run.manifest.stage("extended-sets"):
-        ExtendedSets(
-            partition.modes,
-            tuple(GridSet(grid, part.values - slack) for part in partition.parts),
-            tuple(np.ones(len(grid.nodes), dtype=bool) for _ in partition.parts),
-            0.3, 0.1, np.empty((0, task.chart.dimension)), np.empty(0),
-        ).save(path / "extended_sets.npz")  # fmt: skip
+        sets = [GridSet(partition.grid, part.values - slack) for part in partition.parts]
+        extended(sets).save(path / "extended_sets.npz")
     with run.manifest.stage("retrain"):
         for q in partition.modes:
             linear(task, 0.3 - 0.6 * q).save(path / f"mode_{q}.safetensors")

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import mujoco
 import numpy as np
 import pytest
-from planted import UNICYCLE, ChartPolicy, Cube, Unicycle, spare, steering_policy
+from planted import UNICYCLE, ChartPolicy, Cube, Unicycle, extended, spare, steering_policy
 
 import hyrl_mj
 from hyrl_mj.errors import BadInput
@@ -31,7 +31,6 @@ from hyrl_mj.policies import PolicyController
 from hyrl_mj.runs.directory import Run
 from hyrl_mj.sets import Chart, Grid, GridSet
 from hyrl_mj.simulation import LoopSettings, closed_loop
-from hyrl_mj.stages import ExtendedSets
 from hyrl_mj.stages.grounds import ByEpisodes, ByGame, mode_ground
 from hyrl_mj.tasks import Effort, Learning, Outcome
 from hyrl_mj.viz.section import Section
@@ -122,7 +121,7 @@ def test_stage_6_asks_episodes_where_two_inputs_do_not_fit(monkeypatch):
     plane.start_low, plane.start_high = (-0.5, -0.5), (0.5, 0.5)
     grid = Grid.with_cells(plane.chart, 120)
     part = GridSet.from_mask(grid, np.ones(len(grid.nodes), dtype=bool))
-    sets = ExtendedSets((0,), (part,), (part.mask,), 0.1, 0.1, np.empty((0, 2)), np.empty(0))
+    sets = extended([part])
     assert type(mode_ground(plane, sets, 0)) is ByGame
     monkeypatch.setattr(lattice_module, "MOST_TRANSITIONS", 1_000)
     assert type(mode_ground(plane, sets, 0)) is ByEpisodes

@@ -7,6 +7,8 @@ import pytest
 from planted import (
     ChartPolicy,
     decisions,
+    extended,
+    flow_sets,
     halves,
     homing_policy,
     ideal_controller,
@@ -25,7 +27,7 @@ from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.policies.hybrid import HybridController
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.simulation import KINDS
-from hyrl_mj.stages.extended_sets import ExtendedSets, extend
+from hyrl_mj.stages.extended_sets import extend
 from hyrl_mj.stages.grounds import ByEpisodes, ByGame, Episodes, Judged, mode_ground
 from hyrl_mj.stages.retraining import retrain
 
@@ -34,11 +36,8 @@ from hyrl_mj.stages.retraining import retrain
 
 @pytest.fixture(scope="module")
 def vehicle_sets(vehicle):
-    grid = Grid.with_cells(vehicle.chart, 60)
-    ideal = ideal_controller(vehicle, 0.15)
-    sets = tuple(GridSet(grid, ideal.flow_set(q).signed_distance(grid.nodes)) for q in (0, 1))
-    winning = tuple(grid.nodes[:, 0] < 0.4 for _ in sets)
-    return ExtendedSets((0, 1), sets, winning, 0.3, 0.1, np.empty((0, 2)), np.empty(0))
+    sets = flow_sets(ideal_controller(vehicle, 0.15), 60)
+    return extended(sets, [part.grid.nodes[:, 0] < 0.4 for part in sets])
 
 
 def test_mode_starts_cover_the_set_with_room_for_the_noise(vehicle, vehicle_sets):
@@ -59,8 +58,7 @@ def test_a_mode_that_leaves_its_set_pays_for_ever(vehicle, circle, vehicle_sets)
     np.testing.assert_array_equal(inside, [True, False, True])
     assert domain.exit_reward == 0.0
     grid = Grid.with_cells(circle.chart, 60)
-    whole = GridSet.from_mask(grid, np.ones(60, dtype=bool))
-    sets = ExtendedSets((0,), (whole,), (whole.mask,), 0.5, 0.1, np.empty((0, 1)), np.empty(0))
+    sets = extended([GridSet.from_mask(grid, np.ones(60, dtype=bool))])
     assert mode_ground(circle, sets, 0).domain(gamma=0.9).exit_reward == pytest.approx(-10.0)
 
 
@@ -163,12 +161,10 @@ def test_a_cautious_reward_is_the_least_around(vehicle):
 @pytest.fixture(scope="module")
 def left(vehicle):
     """The ground of the vehicle's mode 0 with ideal sets, where they can be won."""
-    grid = Grid.with_cells(vehicle.chart, 120)
-    ideal = ideal_controller(vehicle, 0.15)
-    sets = tuple(GridSet(grid, ideal.flow_set(q).signed_distance(grid.nodes)) for q in (0, 1))
-    open_ = grid.nodes[:, 1] > -(0.4 - grid.nodes[:, 0])
-    found = ExtendedSets((0, 1), sets, (open_, ~open_), 0.3, 0.1, np.empty((0, 2)), np.empty(0))
-    return mode_ground(vehicle, found, 0)
+    sets = flow_sets(ideal_controller(vehicle, 0.15), 120)
+    x, y = sets[0].grid.nodes.T
+    open_ = y > -(0.4 - x)
+    return mode_ground(vehicle, extended(sets, [open_, ~open_]), 0)
 
 
 def test_the_judge_prefers_a_policy_that_loses_nothing(vehicle, left):
@@ -286,9 +282,8 @@ def by_episodes(puck, sets, mode, policy=None, **changes):
 @pytest.fixture(scope="module")
 def puck_sets(puck):
     grid = Grid.with_cells(puck.chart, 60)
-    sets = tuple(GridSet(grid, -s * grid.nodes[:, 1] - 0.25) for s in (1.0, -1.0))
-    winning = tuple(s * grid.nodes[:, 1] > -0.4 for s in (1.0, -1.0))
-    return ExtendedSets((0, 1), sets, winning, 0.3, 0.1, np.empty((0, 2)), np.empty(0))
+    offsets = [s * grid.nodes[:, 1] for s in (1.0, -1.0)]
+    return extended([GridSet(grid, -y - 0.25) for y in offsets], [y > -0.4 for y in offsets])
 
 
 def round_it(puck, side, clear=0.9):

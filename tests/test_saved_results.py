@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from planted import extended
 from sentences import assert_one_sentence_about
 
 from hyrl_mj import BadArtifact, BadInput, CriticalSet
@@ -61,8 +62,7 @@ def test_sets_of_another_task_are_refused(tmp_path, circle, grid_set):
     Partition((0,), (grid_set,), grid_set.mask).save(tmp_path / "p.npz")
     with pytest.raises(BadArtifact, match=r"p\.npz"):
         Partition.load(tmp_path / "p.npz", circle)
-    nowhere = np.empty((0, 2)), np.empty(0)
-    ExtendedSets((0,), (grid_set,), (grid_set.mask,), 0.3, 0.1, *nowhere).save(tmp_path / "e.npz")
+    extended([grid_set]).save(tmp_path / "e.npz")
     with pytest.raises(BadArtifact, match=r"e\.npz"):
         ExtendedSets.load(tmp_path / "e.npz", circle)
 
@@ -121,9 +121,7 @@ def test_results_describe_themselves_in_a_line(grid_set):
     assert repr(grid_set) == "GridSet(53.8% of 13 x 13 nodes)"
     partition = Partition((0, 1), (grid_set, ~grid_set), grid_set.mask)
     assert repr(partition) == "Partition(0: 53.8%, 1: 46.2% of 13 x 13 nodes)"
-    nowhere = np.empty((0, 2)), np.empty(0)
-    sets = ExtendedSets((0,), (grid_set,), (grid_set.mask,), 0.3, 0.1, *nowhere)
-    assert repr(sets) == "ExtendedSets(0: 53.8% of the chart, eps 0.1)"
+    assert repr(extended([grid_set])) == "ExtendedSets(0: 53.8% of the chart, eps 0.1)"
 
 
 @pytest.mark.parametrize(

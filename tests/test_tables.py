@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from environments import Puck, Slid, puck_agent
-from planted import ChartPolicy, spare_environments
+from planted import ChartPolicy, extended, spare_environments
 
 from hyrl_mj import BadArtifact, from_gymnasium
 from hyrl_mj.judging.game import Lattice, lattice_grid
@@ -14,7 +14,7 @@ from hyrl_mj.judging.worst_case import worst_case
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.simulation import Signal, closed_loop, policy_runs
-from hyrl_mj.stages import ExtendedSets, PartPolicy
+from hyrl_mj.stages import PartPolicy
 from hyrl_mj.stages.grounds import ByAttack, mode_ground
 from hyrl_mj.stages.retraining import retrain
 from hyrl_mj.stages.tables import (
@@ -47,17 +47,9 @@ def slid():
     return from_gymnasium(Slid, steps=120, bounds={"x": (-2.3, 2.3), "y": (-1.7, 1.7)})
 
 
-def extended(grid, *masks, noise=EPS):
+def of_masks(grid, *masks):
     """Returns extended sets of modes 0, 1, ... that are masks (N,) of a grid."""
-    return ExtendedSets(
-        tuple(range(len(masks))),
-        tuple(GridSet.from_mask(grid, mask) for mask in masks),
-        masks,
-        0.0,
-        noise,
-        np.empty((0, 2)),
-        np.empty(0),
-    )
+    return extended([GridSet.from_mask(grid, mask) for mask in masks], masks, 0.0, EPS)
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +59,7 @@ def held(puck):
     x, y = grid.nodes.T
     beside = np.abs(x - np.unique(x)[5]) > 1e-9
     return HeldInputs.from_sets(
-        puck, extended(grid, (y > -0.3) | (x > 0.6), np.ones(grid.size, dtype=bool), beside)
+        puck, of_masks(grid, (y > -0.3) | (x > 0.6), np.ones(grid.size, dtype=bool), beside)
     )
 
 
@@ -241,7 +233,7 @@ def test_the_best_of_what_is_given_is_taken_and_nothing_is_trained(
 
 def test_a_policy_is_judged_without_noise_and_by_an_attack(puck):
     grid = Grid.with_cells(puck.chart, 24)
-    sets = extended(grid, np.ones(grid.size, dtype=bool))
+    sets = of_masks(grid, np.ones(grid.size, dtype=bool))
     ground = mode_ground(puck, sets, 0)
     assert isinstance(ground, ByAttack)
     policy = SimpleNamespace(act=lambda m: np.clip(puck_agent(puck.observation(m)), -4, 4))
@@ -255,7 +247,7 @@ def test_a_policy_is_judged_without_noise_and_by_an_attack(puck):
 def test_no_table_where_arrival_does_not_end_an_episode(puck, held):
     kept = from_gymnasium(Puck, steps=40, success="reward >= -0.25")
     grid = Grid.with_cells(kept.chart, 8)
-    assert HeldInputs.from_sets(kept, extended(grid, np.ones(grid.size, dtype=bool))) is None
+    assert HeldInputs.from_sets(kept, of_masks(grid, np.ones(grid.size, dtype=bool))) is None
     assert kept.learning.cells == round((800_000 / 40) ** 0.5 - 0.5), (
         "fewer cells for whole episodes"
     )
