@@ -9,7 +9,15 @@ import pytest
 
 from hyrl_mj import BadArtifact, BadInput
 from hyrl_mj.files import artifacts, manifest
-from hyrl_mj.files.manifest import FILES, LOCK, NAME, Manifest, check_contents, locked, may_hold
+from hyrl_mj.files.manifest import (
+    FILES,
+    LOCK,
+    NAME,
+    Manifest,
+    check_contents,
+    check_may_hold,
+    locked,
+)
 
 SETTINGS = dict.fromkeys(FILES, "these")
 
@@ -211,12 +219,14 @@ def test_what_a_killed_writer_has_left_goes_and_nothing_else(tmp_path):
 
 
 def test_a_folder_of_a_writer_that_was_killed_at_once_may_hold_a_run(tmp_path):
-    assert may_hold(tmp_path, "config.json")
     for name in (LOCK, ".config.0123456789ab.partial.json"):
+        check_may_hold(tmp_path, "config.json", "a run directory")
         (tmp_path / name).write_text("half")
-    assert may_hold(tmp_path, "config.json")
+    check_may_hold(tmp_path, "config.json", "a run directory")
     (tmp_path / "notes.txt").write_text("mine")
-    assert not may_hold(tmp_path, "config.json")
+    for path in (tmp_path, tmp_path / LOCK):
+        with pytest.raises(BadInput, match="is not a run directory: choose another --out"):
+            check_may_hold(path, "config.json", "a run directory")
 
 
 # ---- links

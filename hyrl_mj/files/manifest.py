@@ -319,13 +319,18 @@ def _left_in(folder: Path) -> Iterator[Path]:
                 yield Path(root, name)
 
 
-def may_hold(folder: Path, name: str) -> bool:
-    """Returns whether a folder holds a file, or only what a process left that was killed at once."""
-    if not folder.is_dir():
-        return False
-    names = {path.name for path in folder.iterdir()}
-    left = {name for name in names if name == LOCK or artifacts.TEMPORARY.fullmatch(name)}
-    return name in names or names == left
+def check_may_hold(folder: Path, name: str, what: str) -> None:
+    """Raises `BadInput` if a folder is there, but is not `what`, "a run directory", with a file `name`.
+
+    It may hold nothing but what a process left that was killed at once.
+    """
+    if folder.is_dir():
+        names = {path.name for path in folder.iterdir()}
+        left = {name for name in names if name == LOCK or artifacts.TEMPORARY.fullmatch(name)}
+        if name in names or names == left:
+            return
+    if folder.exists():
+        raise BadInput(f"{folder} exists and is not {what}: choose another --out")
 
 
 def check_contents(folder: Path) -> None:

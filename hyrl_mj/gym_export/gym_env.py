@@ -123,7 +123,7 @@ class TaskEnv(gym.Env[np.ndarray, Any]):
         state = np.empty(mujoco.mj_stateSize(self.model, _STATE))
         mujoco.mj_getState(self.model, self.data, state, _STATE)
         if not np.array_equal(state, self.core.plant.state[0], equal_nan=True):
-            self.core.plant.put(state[None])
+            self.core.plant.resume(state[None])
 
     def render(self) -> np.ndarray | None:
         """Returns the scene as (height, width, 3) uint8 in render mode "rgb_array", else None."""

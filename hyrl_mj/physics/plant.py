@@ -179,12 +179,8 @@ class Plant:
         """MuJoCo's whole state, rows of `mjSTATE_INTEGRATION`: (n, nstate), a copy."""
         return self._batch.state.copy()
 
-    def put(self, state: np.ndarray) -> None:
-        """Sets the whole state of all copies (n, nstate), as `state` gives it, and updates their sensors."""
-        self.resume(state)
-
     def resume(self, state: np.ndarray, ids: np.ndarray | None = None) -> None:
-        """Lets the copies `ids` (k,), all by default, go on from whole states (k, nstate)."""
+        """Lets the copies `ids` (k,), all by default, go on from rows of `state` (k, nstate)."""
         self._wake()
         rows = self._rows(ids)
         self._batch.state[rows] = state

@@ -11,7 +11,7 @@ import numpy as np
 
 from hyrl_mj.errors import LARGEST_NUMBER, LONGEST, BadArtifact, BadInput
 from hyrl_mj.files import artifacts
-from hyrl_mj.files.manifest import may_hold
+from hyrl_mj.files.manifest import check_may_hold
 from hyrl_mj.runs.improvement import Mean, mean
 
 NAME = "compare.json"
@@ -155,10 +155,7 @@ def opened(folder: Path, fresh: Compared) -> Compared:
         BadInput: the folder holds something else, or a comparison with other settings.
     """
     if not (folder / NAME).exists():
-        if folder.exists() and not may_hold(folder, NAME):
-            raise BadInput(
-                f"{folder} exists and is not the folder of a comparison: choose another --out"
-            )
+        check_may_hold(folder, NAME, "the folder of a comparison")
         return fresh
     there = replace(Compared.load(folder), lasting=fresh.lasting)
     if replace(there, rows=()) != fresh:

@@ -21,7 +21,7 @@ from hyrl_mj import policies
 from hyrl_mj.errors import BadArtifact, BadInput, HyrlError, unknown
 from hyrl_mj.fields import acting_policy
 from hyrl_mj.files import artifacts
-from hyrl_mj.files.manifest import FILES, Manifest, check_contents, locked, may_hold
+from hyrl_mj.files.manifest import FILES, Manifest, check_contents, check_may_hold, locked
 from hyrl_mj.judging import Arrivals, Retraining, Verdict
 from hyrl_mj.judging.game import Lattice, MapClass, Maps, Robustness, lattice_grid
 from hyrl_mj.judging.proof import why_no_cells
@@ -440,8 +440,7 @@ def opened(path: str | Path, settings: Settings, policy: AnyPolicy | None = None
             names them.
     """
     path = Path(path)
-    if path.exists() and not may_hold(path, "config.json"):
-        raise BadInput(f"{path} exists and is not a run directory: choose another --out")
+    check_may_hold(path, "config.json", "a run directory")
     config = path / "config.json"
     if config.exists():
         Config.load(config)  # nothing is written to the folder of another program

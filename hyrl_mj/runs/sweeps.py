@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from hyrl_mj.errors import BadArtifact, BadInput
 from hyrl_mj.files import artifacts
-from hyrl_mj.files.manifest import check_contents, may_hold
+from hyrl_mj.files.manifest import check_contents, check_may_hold
 from hyrl_mj.judging import by_kind
 from hyrl_mj.judging.game import LIMIT, Robustness
 from hyrl_mj.learning import Settings, changed, differing, preset
@@ -263,10 +263,7 @@ def opened(folder: Path, common: Common, rows: Iterable[Row]) -> Sweep:
     """
     rows = tuple(rows)
     if not (folder / NAME).exists():
-        if folder.exists() and not may_hold(folder, NAME):
-            raise BadInput(
-                f"{folder} exists and is not the folder of a sweep: choose another --out"
-            )
+        check_may_hold(folder, NAME, "the folder of a sweep")
         return Sweep(common, rows).checked()
     there = Sweep.load(folder)
     if there.common != common:

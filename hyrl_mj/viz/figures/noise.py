@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib import style as styles
-from matplotlib.figure import Figure
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.files import artifacts
@@ -20,13 +19,13 @@ MOST = 8  # rows: more cannot be read
 SIZES = {"font.size": 13, "axes.titlesize": 13, "legend.fontsize": 12}
 
 
-def draw_noise(noise: LogNoise, path: Path | None = None) -> Figure:
+def draw_noise(noise: LogNoise, path: Path) -> None:
     """Draws the errors of each column of a log, in its unit, and writes a PNG; the first 8 columns.
 
     Raises:
         BadInput: the path does not end in .png.
     """
-    if path is not None and path.suffix != ".png":
+    if path.suffix != ".png":
         raise BadInput(f"--out {path} cannot be written: give a name that ends in .png")
     columns = [column for column in noise.columns if len(column.errors)][:MOST]
     with styles.context(["default", STYLE, SIZES]):
@@ -54,7 +53,5 @@ def draw_noise(noise: LogNoise, path: Path | None = None) -> Figure:
                 histogram.axvline(bound, color=colours.MODES[1], linewidth=2)
             correlation.set(title="autocorrelation", xlabel="lag [samples]", ylim=(-1.05, 1.05))
             correlation.vlines(np.arange(len(c.correlations)), 0, c.correlations, **looks)
-        if path is not None:
-            with artifacts.replacing(path) as png:
-                figure.savefig(png, format="png", dpi=DPI)
-    return figure
+        with artifacts.replacing(path) as png:
+            figure.savefig(png, format="png", dpi=DPI)
