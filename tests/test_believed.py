@@ -56,12 +56,6 @@ def test_noise_cannot_widen_its_own_bound(own, vehicle, monkeypatch):
         simulate(vehicle, policy, [0.0, 0.5], Noise("own", 0.1))
 
 
-def test_noise_has_a_share_of_each_column(vehicle):
-    noise = noises.Uniform(0.1, np.array([1.0]))
-    with pytest.raises(BadInput, match="a share for each of the columns of the measurement"):
-        simulate(vehicle, linear(vehicle, np.zeros((5, 3)), np.zeros(5)), [0.0, 0.5], noise)
-
-
 # ---- controllers: a proof follows the package's own classes, not what inherits from them
 
 

@@ -19,7 +19,7 @@ from planted import played_before
 from sentences import assert_has_ended
 
 import hyrl_mj
-from hyrl_mj import BadInput, cli
+from hyrl_mj import BadInput
 from hyrl_mj.judging.game import MapClass, Maps
 from hyrl_mj.pipeline.steps import STAGES
 from hyrl_mj.runs.arcs import noisy_arcs
@@ -80,14 +80,10 @@ def test_a_run_tells_from_which_starts_a_controller_is_lost(finished):
 
 
 @needs_gl
-def test_run_renders_the_replay(finished):
-    assert (finished[0] / "replay.mp4").stat().st_size > 1_000
-    assert (finished[0] / "replay.png").is_file()
-
-
-@needs_gl
-def test_run_again_does_nothing_again(finished):
+def test_run_renders_the_replay_and_does_nothing_again(finished):
     before = contents(finished[0])
+    assert len(before[finished[0] / "replay.mp4"]) > 1_000
+    assert finished[0] / "replay.png" in before
     again = call("run", "unit_circle", *SMOKE, "--out", finished[0])
     assert_has_ended(again)
     assert again.stdout.count("done before") == len(STAGES)
@@ -190,13 +186,6 @@ def test_the_web_viewer_is_for_this_machine_only(finished):
     assert "Traceback" not in complaints
 
 
-def test_simulate_prints_both_ends(finished):
-    done = call("simulate", finished[0], "--start", "3.0", "--q0", "1", "--noise", "uniform")
-    assert done.returncode == 0, done.stderr
-    assert "policy " in done.stdout
-    assert "hyrl " in done.stdout
-
-
 def test_robustness_prints_the_worst_case_and_the_episodes(copied, monkeypatch):
     played_before(monkeypatch, hyrl_mj.load_run(copied))
     done = call("robustness", copied, "--episodes", "8", "--noise", "uniform,adversarial")
@@ -223,22 +212,21 @@ def test_export_writes_the_controller(form, out, finished, tmp_path):
     assert (tmp_path / out).exists()
 
 
-def test_simulate_finds_the_worst_noise(copied):
-    done = call("simulate", copied, "--start", "3.1416", "--noise", "worst", "--eps", "0.1")
+def test_simulate_finds_the_worst_noise_and_prints_both_ends(copied):
+    words = ("--start", "3.1416", "--q0", "1", "--noise", "worst", "--eps", "0.1")
+    done = call("simulate", copied, *words)
     assert done.returncode == 0, done.stderr
+    assert "policy " in done.stdout
+    assert "hyrl " in done.stdout
     arc = hyrl_mj.HybridArc.load(copied / "arcs" / "latest_policy.npz")
     assert (arc.noise, arc.outcome) == ("worst", "stalled")
     assert abs(arc.measured[:-1] - arc.z[:-1]).max() <= 0.1 + 1e-9
 
 
-def test_list_and_help():
+def test_list():
     listed = call("list").stdout.split()
     own = {name for name in hyrl_mj.task_names() if hyrl_mj.get_task(name).source is None}
     assert {"vehicle", "slalom", "gaps", "gate"} <= own <= set(listed)
-    for command in cli.COMMANDS:
-        helped = call(command, "--help")
-        assert helped.returncode == 0
-        assert "usage: hyrl-mj" in helped.stdout
 
 
 @pytest.mark.parametrize(
@@ -247,11 +235,9 @@ def test_list_and_help():
         (["run", "unicycle"], ["'unicycle'", "unit_circle, vehicle"]),
         (["run", "vehicle", "--preset", "quick"], ["'quick'", "fast, paper, smoke"]),
         (["run", "vehicle", "--eps", "-0.1"], ["-0.1", ">= 0"]),
-        (["run", "vehicle", "--eps", "much"], ["--eps", "'much'", "give a number"]),
         (["run", "vehicle", "--horizon", "0"], ["horizon 0", "> 0"]),
         (["run", "vehicle", "--eps", "1.5"], ["1.5 hides the whole state space", "below 1.5 m"]),
         (["run", "vehicle", "--seed", "-1"], ["seed -1", "from 0 to"]),
-        (["traim"], ["traim", "critical-set"]),
     ],
 )
 def test_bad_input_before_anything_is_made(arguments, parts, tmp_path):
@@ -282,7 +268,6 @@ def test_bad_input_before_anything_is_made(arguments, parts, tmp_path):
         (["export", "--to", "tflite", "--out", "x"], ["'tflite'", "onnx, numpy"]),
         (["export", "--to", "onnx", "--out", "/dev/null/x"], ["a place that can be written"]),
         (["simulate", "--start", "1", "--time", "1e12"], ["horizon 1e+12", "3600"]),
-        (["replay", "--size", "big"], ["'big'", "640x480"]),
     ],
 )
 def test_bad_input_leaves_the_run_as_it_was(arguments, parts, finished):

@@ -1,7 +1,6 @@
 """Why starts are lost: indecision that holding the way cures, or passing closer than the noise."""
 
 import numpy as np
-import pytest
 from planted import ChartPolicy, halves, pass_on, sign_policy
 
 from hyrl_mj import simulate
@@ -71,9 +70,3 @@ def test_a_policy_that_stands_still_fails_without_noise(circle):
         f"it loses all {len(losses.unaided)} lost nodes without noise, too: it fails"
     )
     assert "closer than the noise" not in said
-
-
-@pytest.mark.parametrize("eps", [0.0])
-def test_without_noise_nothing_is_lost(vehicle, eps):
-    losses = sorted_losses(vehicle, sign_policy(vehicle), eps)
-    assert losses_sentence(losses) == "it loses none of them on the nodes"

@@ -254,12 +254,16 @@ def test_noise_against_a_controller_makes_no_sense_in_an_environment(vehicle):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("noise", ["uniform", 0.1])
+@pytest.mark.parametrize("noise", ["uniform", 0.1, True, np.nan, [0.1]])
 def test_what_is_no_noise_gets_an_example(vehicle, noise):
-    with pytest.raises(BadInput, match=r'cannot be used: give a hyrl_mj.Noise\("uniform", 0.1\)'):
-        closed_loop(vehicle, PolicyController(sign_policy(vehicle)), np.zeros((1, 2)), noise)
-    with pytest.raises(BadInput, match="cannot be used: give a"):
-        gym.make(vehicle.env_id, noise=noise)
+    loop, z = PolicyController(sign_policy(vehicle)), np.zeros((1, 2))
+    for use in (
+        lambda: closed_loop(vehicle, loop, z, noise),
+        lambda: gym.make(vehicle.env_id, noise=noise),
+        lambda: gym.make_vec(vehicle.env_id, 2, "vector_entry_point", noise=noise),
+    ):
+        with pytest.raises(BadInput, match=r'cannot be used: give a hyrl_mj.Noise\("uniform", 0.1'):
+            use()
 
 
 def test_noise_that_hides_the_whole_chart_is_refused(vehicle):
