@@ -384,18 +384,16 @@ def test_a_task_method_that_cannot_be_followed_is_named(method, said, circle, tm
 
 
 def test_policies_and_sets_of_other_kinds_are_refused(vehicle, circle, tmp_path):
-    with pytest.raises(BadInput, match="policy of mode 0 is a ChartPolicy"):
-        export_numpy(
-            replace(ideal_controller(vehicle), flow_sets=planted(vehicle).flow_sets), tmp_path
-        )
-    anywhere = dict.fromkeys((0, 1), AnalyticSet(lambda z: z[:, 0]))
-    with pytest.raises(BadInput, match="flow set of mode 0 is a AnalyticSet"):
-        export_onnx(replace(planted(vehicle), flow_sets=anywhere), tmp_path / "x.onnx")
-    foreign = replace(planted(vehicle), policies=planted(circle).policies)
-    with pytest.raises(BadInput, match="for unit_circle, not vehicle"):
-        export_numpy(foreign, tmp_path)
-    with pytest.raises(BadInput, match=r"modes \(-1, 0\)"):
-        export_numpy(planted(vehicle, modes=(-1, 0)), tmp_path)
+    usual, anywhere = planted(vehicle), dict.fromkeys((0, 1), AnalyticSet(lambda z: z[:, 0]))
+    for controller, said in (
+        (replace(usual, policies=ideal_controller(vehicle).policies), "0 is a ChartPolicy"),
+        (replace(usual, flow_sets=anywhere), "flow set of mode 0 is a AnalyticSet"),
+        (replace(usual, policies=planted(circle).policies), "for unit_circle, not vehicle"),
+        (planted(vehicle, modes=(-1, 0)), r"modes \(-1, 0\)"),
+    ):
+        for name, export in FORMS.items():
+            with pytest.raises(BadInput, match=said):
+                export(controller, tmp_path / name)
     assert not list(tmp_path.iterdir())
 
 
@@ -518,13 +516,18 @@ WHOLE = {
 }  # fmt: skip
 
 
+def written_function(program):
+    """The function that is written for a program, as NumPy executes it."""
+    arrays = {}
+    space = {"np": np, "ARRAYS": arrays}
+    exec(write_function("f", "It does something.", program, arrays), space)
+    return space["f"]
+
+
 @pytest.mark.parametrize("name", WHOLE)
 def test_operations_survive_both_forms(name):
     program = trace(WHOLE[name], {"x": RNG(0).normal(size=(BATCH, 3))}, name)
-    arrays = {}
-    source = write_function("f", "It does something.", program, arrays)
-    space = {"np": np, "ARRAYS": arrays}
-    exec(source, space)
+    function = written_function(program)
     model = write_graph(program, ("y",), "f", {})
     read = {name for node in model.graph.node for name in node.input}
     assert {constant.name for constant in model.graph.initializer} <= read
@@ -532,19 +535,19 @@ def test_operations_survive_both_forms(name):
     for n in (1, 5, 300):
         x = 2 * RNG(n).normal(size=(n, 3))
         wanted = WHOLE[name](x)
-        for result in (space["f"](x), session.run(None, {"x": x})[0]):
+        for result in (function(x), session.run(None, {"x": x})[0]):
             assert result.dtype == wanted.dtype
             np.testing.assert_allclose(result, wanted, rtol=1e-12, atol=1e-14)
 
 
 def test_gelu_takes_the_error_function_of_scipy():
+    def gelu(x):
+        return x * special.erf(x / np.sqrt(np.float32(2)))
+
     x = np.linspace(-5, 5, BATCH, dtype=np.float32)[:, None]
-    program = trace(lambda x: x * special.erf(x / np.sqrt(np.float32(2))), {"x": x}, "gelu")
-    space = {"np": np}
-    exec(write_function("f", "", program, {}), space)
-    wanted = x * special.erf(x / np.sqrt(np.float32(2)))
-    assert space["f"](x).dtype == np.float32
-    np.testing.assert_allclose(space["f"](x), wanted, rtol=0, atol=2e-6)
+    found = written_function(trace(gelu, {"x": x}, "gelu"))(x)
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, gelu(x), rtol=0, atol=2e-6)
 
 
 # ---- code of many shapes, and NumPy as it is for everybody else
@@ -622,12 +625,8 @@ exec(
 @pytest.mark.parametrize("shape", SHAPES)
 def test_code_is_followed_into(shape):
     program = trace(SHAPES[shape], {"x": RNG(0).normal(size=(BATCH, 2))}, shape)
-    arrays = {}
-    source = write_function("f", "It does something.", program, arrays)
-    space = {"np": np, "ARRAYS": arrays}
-    exec(source, space)
     x = RNG(1).normal(size=(5, 2))
-    np.testing.assert_allclose(space["f"](x), SHAPES[shape](x), rtol=1e-15)
+    np.testing.assert_allclose(written_function(program)(x), SHAPES[shape](x), rtol=1e-15)
 
 
 def test_methods_of_other_objects_run_as_they_are():

@@ -451,12 +451,6 @@ def test_impossible_wishes_are_refused(tmp_path, show, name, options, message):
     assert not list(tmp_path.iterdir())
 
 
-def test_nothing_to_replay(tmp_path, crash):
-    for shows in ([], [Show([], [crash])]):
-        with pytest.raises(BadInput, match="give shows with arcs of the policy"):
-            render_replay(TASK, shows, tmp_path / "replay.mp4")
-
-
 @needs_gl
 @pytest.mark.parametrize("ffmpeg", ["missing", "fails"])
 def test_nothing_is_left_behind_when_ffmpeg_fails(tmp_path, show, monkeypatch, ffmpeg):

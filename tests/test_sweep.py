@@ -169,23 +169,18 @@ def test_options_of_one_value_and_of_several():
 
 def test_a_stranger_s_sweep_leads_nowhere_else(tmp_path):
     Sweep(Common("smoke", None, {}), (Row(CIRCLE, 0),)).save(tmp_path)
-    text = (tmp_path / "sweep.json").read_text()
+    content = json.loads((tmp_path / "sweep.json").read_text())
+    content = {name: content[name] for name in ("common", "rows")}
+
+    def reported(**setting):
+        content["rows"][0]["setting"] |= setting
+        artifacts.write_json(tmp_path / "sweep.json", content, kind="sweep")
+        return report(tmp_path).rows
+
     for other in ("../../unit_circle", "", "/"):
-        content = json.loads(text)
-        content["rows"][0]["setting"]["task"] = other
-        artifacts.write_json(
-            tmp_path / "sweep.json",
-            {name: content[name] for name in ("common", "rows")},
-            kind="sweep",
-        )
-        names = [row.name for row in report(tmp_path).rows]
-        assert all(Path(name).name == name for name in names)
-    content["rows"][0]["setting"]["algorithm"] = "a/../../b"
-    artifacts.write_json(
-        tmp_path / "sweep.json", {name: content[name] for name in ("common", "rows")}, kind="sweep"
-    )
+        assert all(Path(row.name).name == row.name for row in reported(task=other))
     with pytest.raises(BadArtifact, match="cannot be the name of a folder"):
-        report(tmp_path)
+        reported(algorithm="a/../../b")
     (tmp_path / "unit_circle-0.1-0").symlink_to("/")
     with pytest.raises(BadArtifact, match="is a link"):
         report(tmp_path)
