@@ -4,6 +4,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib.metadata import version
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -30,6 +31,17 @@ from hyrl_mj.stages.partition import Partition
 from hyrl_mj.tasks import Learning, Outcome, Scene, Task, trial
 from hyrl_mj.viz import diagnosis, section
 from hyrl_mj.viz.figures import style
+
+
+@dataclass(frozen=True)
+class Payload:
+    """What must never be unpickled: it makes an empty file."""
+
+    path: Path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
 
 # Settings of a smoke run on the circle whose worst-case game takes two seconds.
 FEW_CELLS = {"lattice": 130}
@@ -84,12 +96,13 @@ def without_pictures(patch):
     without_pdfs(patch, write)
 
 
+def no_renderer(*arguments, **options):
+    """In the place of what draws, as on a machine that cannot."""
+    raise NoRenderer("no GL library here")
+
+
 def without_videos(patch):
     """Patches rendering, as on a machine that cannot draw: there is no video."""
-
-    def no_renderer(*arguments, **options):
-        raise NoRenderer("no GL library here")
-
     patch.setattr("hyrl_mj.viz.replay.render_replay", no_renderer)
 
 

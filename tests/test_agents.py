@@ -6,12 +6,11 @@ import json
 import pickle
 import sys
 import zipfile
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from planted import random_states
+from planted import Payload, random_states
 from stable_baselines3 import A2C, DDPG, DQN, PPO, SAC, TD3
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.sac.policies import SACPolicy
@@ -287,16 +286,6 @@ def test_what_has_no_distribution_is_not_drawn_from(algorithm, name, tmp_path):
 
 
 # ---- files that are somebody else's
-
-
-class Payload:
-    """Unpickling it creates a file."""
-
-    def __init__(self, path):
-        self.path = path
-
-    def __reduce__(self):
-        return Path.touch, (self.path,)
 
 
 @pytest.fixture

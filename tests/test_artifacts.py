@@ -1,13 +1,13 @@
 """Artifacts come back as they were, are replaced whole or not at all, and named if damaged."""
 
 import json
-import os
 import pickle
 import zipfile
 
 import numpy as np
 import pytest
 from memory import Peak
+from planted import Payload
 from sentences import assert_one_sentence_about
 
 from hyrl_mj import BadArtifact
@@ -15,16 +15,6 @@ from hyrl_mj.files import artifacts
 
 ARRAYS = {"a": np.arange(500.0).reshape(50, 10), "name": np.array("word"), "flag": np.array([True])}
 CONTENT = {"x": 1.5, "items": [1, 2, 3]}
-
-
-class Bomb:
-    """What must never go off: unpickling this would make a file."""
-
-    def __init__(self, path):
-        self.path = path
-
-    def __reduce__(self):
-        return os.mkdir, (str(self.path),)
 
 
 def write(kind, path):
@@ -151,7 +141,7 @@ def test_another_kind_is_named(ending, tmp_path):
 
 def test_a_pickle_in_an_npz_is_refused_and_not_run(tmp_path):
     path, crater = tmp_path / "a.npz", tmp_path / "crater"
-    bomb = np.array([Bomb(crater)], dtype=object)
+    bomb = np.array([Payload(crater)], dtype=object)
     np.savez(path, kind=np.array("thing"), version=np.array(1), a=bomb)
     with pytest.raises(BadArtifact):
         artifacts.read_arrays(path, "thing")
@@ -161,7 +151,7 @@ def test_a_pickle_in_an_npz_is_refused_and_not_run(tmp_path):
 @pytest.mark.parametrize("ending", ["json", "npz", "safetensors"])
 def test_a_pickle_under_another_name_is_refused_and_not_run(ending, tmp_path):
     path, crater = tmp_path / f"a.{ending}", tmp_path / "crater"
-    path.write_bytes(pickle.dumps(Bomb(crater)))
+    path.write_bytes(pickle.dumps(Payload(crater)))
     with pytest.raises(BadArtifact):
         read(ending, path)
     assert not crater.exists()

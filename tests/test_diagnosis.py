@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from planted import ChartPolicy, homing_policy, sign_policy
+from planted import ChartPolicy, homing_policy, no_renderer, sign_policy
 
 import hyrl_mj
-from hyrl_mj import HybridArc, NoRenderer
+from hyrl_mj import HybridArc
 from hyrl_mj.learning import presets
 from hyrl_mj.runs.diagnosis import losses_of, losses_sentence, usual_arc, worst_arc
 from hyrl_mj.viz import diagnosis
@@ -16,10 +16,6 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("small_runs")]  # a diag
 
 EPS = 0.1
 PLANTED = {"unit_circle": homing_policy, "vehicle": sign_policy}
-
-
-def no_renderer(*arguments, **options):
-    raise NoRenderer("no GL library here")
 
 
 @pytest.fixture(scope="module", params=["unit_circle", "vehicle"])

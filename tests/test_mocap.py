@@ -18,6 +18,7 @@ from hyrl_mj.policies import PolicyController
 from hyrl_mj.sets import Chart
 from hyrl_mj.simulation import LoopSettings, closed_loop
 from hyrl_mj.tasks import Outcome, Scene, Task, check_task
+from hyrl_mj.tasks.vehicle import Vehicle
 from hyrl_mj.viz.replay.marks import tracked_points
 from hyrl_mj.viz.viewing import show
 
@@ -279,39 +280,25 @@ def test_viewers_and_marks_show_them_at_the_phase(swing):
 # ---- mistakes
 
 
-def changed(mocap):
-    task = type("Wrong", (Swing,), {"mocap": mocap})()
-    with pytest.raises(BadInput) as error:
+def by_row(self, qpos):
+    return np.tile(np.arange(len(qpos))[:, None, None] * 0.1, (1, 2, 3))
+
+
+@pytest.mark.parametrize(
+    ("kind", "mocap", "said"),
+    [
+        (Swing, lambda self, qpos: qpos, r"mocap\(\) gives shape .*2 mocap body\(s\)"),
+        (Swing, lambda self, qpos: np.full((len(qpos), 2, 3), np.nan), r"mocap\(\) gives \[\[nan"),
+        (Swing, by_row, "let it depend on this row alone"),
+        (Swing, lambda self, qpos: qpos[:, 9], r"mocap\(\) of the task swing raises IndexError"),
+        (Vehicle, lambda self, qpos: qpos, "has no mocap body"),
+    ],
+)
+def test_a_rule_that_gives_no_poses_is_refused(kind, mocap, said):
+    task = type("Wrong", (kind,), {"mocap": mocap, "source": None})()
+    with pytest.raises(BadInput, match=said) as error:
         check_task(task)
     assert "\n" not in str(error.value)
-    return str(error.value)
-
-
-def test_what_has_a_wrong_shape_is_refused():
-    said = changed(lambda self, qpos: qpos)
-    assert "mocap() gives shape" in said
-    assert "2 mocap body(s)" in said
-
-
-def test_what_is_not_finite_is_refused():
-    assert "mocap() gives [[nan" in changed(lambda self, qpos: np.full((len(qpos), 2, 3), np.nan))
-
-
-def test_what_depends_on_other_rows_is_refused():
-    def mocap(self, qpos):
-        return np.tile(np.arange(len(qpos))[:, None, None] * 0.1, (1, 2, 3))
-
-    assert "let it depend on this row alone" in changed(mocap)
-
-
-def test_an_error_of_its_own_is_named():
-    assert "mocap() of the task swing raises IndexError" in changed(lambda self, qpos: qpos[:, 9])
-
-
-def test_a_rule_without_bodies_is_refused(vehicle):
-    task = type("Wrong", (type(vehicle),), {"mocap": lambda self, qpos: qpos, "source": None})()
-    with pytest.raises(BadInput, match="has no mocap body"):
-        check_task(task)
 
 
 def test_a_keyframe_that_places_a_mocap_body_elsewhere_is_refused():
