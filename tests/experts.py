@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import mujoco
 import numpy as np
 
 import hyrl_mj
@@ -9,10 +10,23 @@ from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.simulation.rollout import LoopSettings, closed_loop
 
 
-def moved(task, policy, z0, steps=None):
+def moved(task, policy, z0, **settings):
     """Runs (n,) of a policy from chart points, quietly."""
-    settings = LoopSettings(steps=steps, quiet=True)
+    settings = LoopSettings(quiet=True, **settings)
     return closed_loop(task, PolicyController(policy), np.array(z0), settings=settings)
+
+
+def distances(model, geoms, obstacle, positions):
+    """How far the nearest of some geoms is from an obstacle, by MuJoCo, at positions (n, nq): (n,) [m]."""
+    data, found = mujoco.MjData(model), []
+    others, obstacle = [model.geom(name).id for name in geoms], model.geom(obstacle).id
+    for qpos in positions:
+        data.qpos[:] = qpos
+        mujoco.mj_forward(model, data)
+        found.append(
+            min(mujoco.mj_geomDistance(model, data, g, obstacle, 9.0, None) for g in others)
+        )
+    return np.array(found)
 
 
 class Constant:

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
-from experts import moved
+from experts import distances, moved
 from planted import ChartPolicy
 
 import hyrl_mj
@@ -38,18 +38,9 @@ def folding(task, side=None):
 
 
 def test_its_clearance_is_that_of_mujoco(arm):
-    rng = np.random.default_rng(0)
-    data, q = mujoco.MjData(arm.model), rng.uniform(-np.pi, np.pi, (300, 2))
+    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (300, 2))
     q[:100, 0] *= 0.3
-    expected, post = [], arm.model.geom("obstacle").id
-    for angles in q:
-        data.qpos[:] = angles
-        mujoco.mj_forward(arm.model, data)
-        links = (arm.model.geom(name).id for name in ("upper_link", "fore_link"))
-        expected.append(
-            min(mujoco.mj_geomDistance(arm.model, data, g, post, 2.0, None) for g in links)
-        )
-    expected = np.array(expected)
+    expected = distances(arm.model, ("upper_link", "fore_link"), "obstacle", q)
     assert 20 < (expected < 0).sum() < 280
     apart = expected > 0
     np.testing.assert_allclose(arm.clearance(q)[apart], expected[apart], atol=1e-4)

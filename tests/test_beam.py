@@ -1,9 +1,8 @@
 """The quadrotor passes the end of a beam on four sides, and decides in time or crashes."""
 
-import mujoco
 import numpy as np
 import pytest
-from experts import Constant, moved
+from experts import Constant, distances, moved
 from planted import ChartPolicy
 
 import hyrl_mj
@@ -38,15 +37,8 @@ def passing(task, side=None):
 
 
 def test_its_clearance_is_that_of_mujoco(beam):
-    rng, data = np.random.default_rng(0), mujoco.MjData(beam.model)
-    z = rng.uniform(beam.chart.low, beam.chart.high, (300, 3))
-    hull, block = (beam.model.geom(name).id for name in ("hull", "obstacle"))
-    distance = []
-    for qpos in beam.state(z)[0]:
-        data.qpos[:] = qpos
-        mujoco.mj_forward(beam.model, data)
-        distance.append(mujoco.mj_geomDistance(beam.model, data, hull, block, 9.0, None))
-    distance = np.array(distance)
+    z = np.random.default_rng(0).uniform(beam.chart.low, beam.chart.high, (300, 3))
+    distance = distances(beam.model, ["hull"], "obstacle", beam.state(z)[0])
     apart = distance > 0
     assert 150 < apart.sum() < 300
     np.testing.assert_allclose(beam.clearance(z)[apart], distance[apart], atol=1e-6)

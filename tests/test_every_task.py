@@ -67,5 +67,5 @@ def test_an_expert_survives_from_every_start(name, late):
 def test_a_mirror_image_moves_the_mirrored_way(name, u, off):
     robot = hyrl_mj.get_task(name)
     z = robot.starts(20, np.random.default_rng(0))
-    runs = [moved(robot, Constant(s * u), z * [1, s, s], 15) for s in (1, -1)]
+    runs = [moved(robot, Constant(s * u), z * [1, s, s], steps=15) for s in (1, -1)]
     np.testing.assert_allclose(runs[0].path, runs[1].path * [1, -1, -1], atol=off)

@@ -3,13 +3,12 @@
 import mujoco
 import numpy as np
 import pytest
+from experts import Constant, moved
 from planted import ChartPolicy
 
 import hyrl_mj
 from hyrl_mj import Outcome
 from hyrl_mj.physics import mjcf
-from hyrl_mj.policies import PolicyController
-from hyrl_mj.simulation import LoopSettings, closed_loop
 from hyrl_mj.stages import find_critical_set
 
 ROOM = 0.6  # between the expert's way and where the pillar will be [m]
@@ -41,15 +40,6 @@ def expert(task, side=None):
     return ChartPolicy(task, rule)
 
 
-def drive(task, policy, z0, **settings):
-    loop, settings = PolicyController(policy), LoopSettings(quiet=True, **settings)
-    return closed_loop(task, loop, np.array(z0, dtype=float), settings=settings)
-
-
-def constant(task, u):
-    return ChartPolicy(task, lambda z: np.full((len(z), 1), u))
-
-
 def test_one_sample_is_its_equation(gate):
     z = np.random.default_rng(0).uniform(gate.chart.low, gate.chart.high, (500, 3))
     u = np.random.default_rng(1).uniform(-1, 1, (500, 1))
@@ -65,7 +55,7 @@ def test_one_sample_is_its_equation(gate):
 
 def test_the_pillar_in_the_picture_is_where_its_phase_says(gate):
     data = mujoco.MjData(gate.model)
-    runs = drive(gate, constant(gate, 1.0), [[0.0, -0.8, 2.0], [0.2, 0.0, -1.0]], record=True)
+    runs = moved(gate, Constant(1.0), [[0.0, -0.8, 2.0], [0.2, 0.0, -1.0]], record=True)
     geom = mjcf.object_id(gate.model, mujoco.mjtObj.mjOBJ_GEOM, "obstacle")
     low, high = np.inf, -np.inf
     for state, z in zip(runs.state[:, 0], runs.path[:, 0], strict=True):
@@ -78,7 +68,7 @@ def test_the_pillar_in_the_picture_is_where_its_phase_says(gate):
 
 
 def test_its_phase_goes_on_beyond_a_period(gate):
-    runs = drive(gate, constant(gate, 0.0), [[0.0, 1.2, 3.0], [0.0, 1.2, -3.0]])
+    runs = moved(gate, Constant(0.0), [[0.0, 1.2, 3.0], [0.0, 1.2, -3.0]])
     k = np.arange(len(runs.path))[:, None]
     expected = np.array([3.0, -3.0]) + gate.speeds[2] * gate.dt * k
     np.testing.assert_allclose(runs.path[..., 2], expected, atol=1e-5)
@@ -98,10 +88,10 @@ def test_what_touches_the_pillar_has_crashed(gate, phase):
 
 def test_who_waits_for_the_pillar_is_hit_and_who_knows_its_phase_is_not(gate):
     z = gate.starts(500, np.random.default_rng(0))
-    knows = drive(gate, expert(gate), z)
+    knows = moved(gate, expert(gate), z)
     assert (knows.outcome == Outcome.REACHED).all()
     assert gate.miss(knows.path[-1]).max() < gate.close
-    blind = drive(gate, constant(gate, 0.0), z)
+    blind = moved(gate, Constant(0.0), z)
     assert 0.3 < (blind.outcome == Outcome.CRASHED).mean() < 0.9
 
 
@@ -109,9 +99,9 @@ def test_the_way_is_the_side_of_the_pillar_where_it_then_is(gate):
     z = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, np.pi]])  # it will be on the left, and on the right
     for y, ways in ((0.0, [1, 0]), (0.45, [0, 0]), (-0.45, [1, 1])):
         starts = z + np.array([0.0, y, 0.0])
-        assert gate.direction(drive(gate, expert(gate), starts).path).tolist() == ways
+        assert gate.direction(moved(gate, expert(gate), starts).path).tolist() == ways
     for side, way in ((1, 0), (-1, 1)):
-        path = drive(gate, expert(gate, side), z).path
+        path = moved(gate, expert(gate, side), z).path
         assert gate.direction(path).tolist() == [way, way]
         # Beyond a period it is the same, and behind the pillar nothing is left to decide.
         assert gate.direction(path + np.array([0, 0, 4 * np.pi])).tolist() == [way, way]
@@ -121,7 +111,7 @@ def test_the_way_is_the_side_of_the_pillar_where_it_then_is(gate):
 def test_half_a_period_later_it_is_its_mirror_image(gate):
     z = gate.starts(50, np.random.default_rng(0))
     image = z * [1, -1, 1] + [0, 0, np.pi]
-    path, mirrored = (drive(gate, expert(gate), starts).path for starts in (z, image))
+    path, mirrored = (moved(gate, expert(gate), starts).path for starts in (z, image))
     np.testing.assert_allclose(mirrored[..., 1], -path[..., 1], atol=1e-5)
     seen = [gate.observation(points) for points in (z, image)]
     np.testing.assert_allclose(seen[1], seen[0] * gate.mirror.observation, atol=1e-12)

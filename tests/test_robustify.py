@@ -327,19 +327,10 @@ def test_a_function_is_distilled_part_by_part(circle_run, ground):
 
 def test_dqn_goes_on_from_weights_that_fit_and_else_afresh(robust, vehicle):
     run = hyrl_mj.load_run(robust[0])
-    assert (
-        start_of(
-            run, run.policy, mode_ground(vehicle, run.extended_sets, 0), algorithm="dqn", options={}
-        )
-        is run.policy
-    )
     function = hyrl_mj.from_callable(lambda o: np.zeros(len(o), dtype=int), vehicle)
-    assert (
-        start_of(
-            run, function, mode_ground(vehicle, run.extended_sets, 0), algorithm="dqn", options={}
-        )
-        is None
-    )
+    for policy, expected in ((run.policy, run.policy), (function, None)):
+        ground = mode_ground(vehicle, run.extended_sets, 0)
+        assert start_of(run, policy, ground, algorithm="dqn", options={}) is expected
 
 
 def test_a_start_that_will_do_is_not_trained(circle_run, monkeypatch):
