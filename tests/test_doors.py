@@ -301,6 +301,7 @@ def test_a_module_that_the_user_names_comes_last(tmp_path, monkeypatch):
     path = code(tmp_path, "my_module.py")
     assert trust.module_file("my_module.sub:Puck-v0").resolve() == path.resolve()
     assert trust.module_file("mujoco:X").parent.name == "mujoco"
+    monkeypatch.setattr(sys.modules["__main__"], "__spec__", None)  # `python -m pytest` has one
     for name in ("", "__main__", "no_such_module"):
         assert trust.module_file(name) is None
 
