@@ -448,3 +448,95 @@ def test_samples_that_the_noise_told_cannot_show_are_told(gaussian, of):
     found = of(planted(10, 0.05, seconds=200, gaussian=gaussian, **kinds))
     told = f"% of the samples of x are beyond what {found.text} can show"
     assert any(told in remark for remark in found.remarks) == bool(gaussian)
+
+
+# ---- what strangers' logs hold
+
+
+@pytest.mark.parametrize("turn", [360.0, 1.0, np.pi, 4096.0])
+def test_angles_jump_by_a_turn_in_any_unit(turn, of):
+    """Where only the measurement is one of a single turn, too."""
+    log = planted(0, 0.05, amplitude=2.5, uniform=0.05, delay=2)
+    scaled = {name: turn / (2 * np.pi) * log[name] for name in ("x", "x_ref")}
+    wrapped = {name: np.mod(values, turn) for name, values in scaled.items()}
+    for some in (wrapped, scaled | {"x": wrapped["x"]}):
+        with pytest.raises(BadInput, match=r"if it is an angle.*give --turn x"):
+            of(log | some)
+    noise = of(log | wrapped, turn={"x": turn})
+    assert noise.bound == pytest.approx(0.05 * turn / (2 * np.pi), rel=0.1)
+
+
+def test_a_sensor_that_is_mounted_the_other_way_round_has_a_bias_of_half_a_turn(of):
+    log = planted(0, 0.05, amplitude=2.5, uniform=0.1, bias=3.1)
+    noise = of(log | {name: np.mod(log[name], 2 * np.pi) for name in ("x", "x_ref")}, turn=["x"])
+    assert noise.bias == pytest.approx(3.1, rel=0.01)
+    assert noise.bound == pytest.approx(0.1, rel=0.1)
+
+
+def test_a_reference_with_long_gaps_makes_no_drift(of):
+    log = planted(4, 0.05, uniform=0.05, bias=0.1)
+    log["x_ref"][:2_000] = log["x_ref"][4_000:] = np.nan
+    noise = of(log)
+    assert noise.drift == 0
+    assert noise.bias == pytest.approx(0.1, rel=0.1)
+
+
+@pytest.mark.parametrize("every", [2, 5])
+def test_a_reference_of_a_lower_rate_is_told(every, of):
+    log = planted(0, 0.05, uniform=0.05)
+    rows = np.arange(len(log["t"]))
+    held = log | {"x_ref": log["x_ref"][rows // every * every]}
+    assert "as one that is sampled less often" in str(of(held).remarks)
+    new = of(log | {"x_ref": np.where(rows % every, np.nan, log["x_ref"])})
+    assert new.bound == pytest.approx(0.05, rel=0.1)
+    # A robot that moves in steps is none.
+    steps = np.sign(np.sin(log["t"]))
+    assert not of(log | {"x": log["x"] - log["x_ref"] + steps, "x_ref": steps}).remarks
+
+
+def test_a_clock_beside_a_robot_at_rest_is_no_measurement(of):
+    log = {"stamp": np.arange(2_000) * 0.05, "x": np.random.default_rng(0).uniform(-1, 1, 2_000)}
+    with pytest.raises(BadInput, match=r"stamp rises in each row.*--columns x"):
+        of(log, dt=0.05, at_rest=True)
+    assert of({"x": log["x"]}, dt=0.05, at_rest=True).bound == pytest.approx(1, rel=0.1)
+
+
+@pytest.mark.parametrize("longest", [20, 600])
+def test_a_single_loss_of_many_samples_is_as_long_as_it_is(longest, of):
+    """Also where the probability of as many in a row is no number."""
+    log = planted(4, 0.05, uniform=0.05)
+    log["x"][2_000 : 2_000 + longest] = log["x"][1_999]
+    assert of(log).held == longest
+
+
+def test_steps_of_a_quantum_may_lie_anywhere(of):
+    log = planted(0, 0.05, quantum=0.05)
+    log["x"] += 0.02
+    assert of(log).text.startswith("bias 0.0")
+    assert of(log).held == 0
+    log = planted(0, 0.05, quantum=0.02, hold=(2, 0.3))
+    log["x"] += 0.007
+    assert of(log).held_rate == pytest.approx(0.3, rel=0.1)
+
+
+def test_held_samples_are_not_guessed_where_steps_are_uneven(of):
+    log = planted(0, 0.05, uniform=0.002)
+    log["x"] = np.array([float(f"{x:.3g}") for x in log["x"]])
+    noise = of(log)
+    assert noise.held == 0
+    assert "x is rounded in uneven steps" in str(noise.remarks)
+
+
+@pytest.mark.parametrize("delay", [5, 40])
+def test_a_delay_is_found_in_a_log_of_a_high_rate(delay, of):
+    """Of which the next sample is hardly another."""
+    noise = of(planted(0, 0.001, uniform=0.05, delay=delay, hold=(3, 0.2), seconds=60))
+    assert noise.delay == pytest.approx(delay, abs=max(1, delay / 10))
+    assert (noise.held, noise.drift) == (3, 0)
+
+
+def test_a_file_with_other_signs_between_its_cells_says_so(tmp_path):
+    path = write(tmp_path / "log.csv", planted(0, 0.05, uniform=0.05))
+    path.write_text(path.read_text().replace(",", ";").replace(".", ","))
+    with pytest.raises(BadInput, match="has ';' between its names: give commas between cells"):
+        noise_from_log(path)

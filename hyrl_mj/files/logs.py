@@ -100,6 +100,10 @@ def _check(path: str | Path, header: Sequence[str]) -> None:
             f"{path} has {len(header):,} names of up to {max(map(len, header)):,} characters: give at most "
             f"{MOST:,} of at most {LONGEST}"
         )
+    if len(header) == 1 and (other := [sign for sign in "\t;|" if sign in header[0]]):
+        raise BadInput(
+            f"{path} has {other[0]!r} between its names: give commas between cells, and points in numbers"
+        )
     twice = [name for name, count in Counter(header).items() if count > 1]
     for name in header:
         if has_controls(name):

@@ -126,6 +126,7 @@ def column_noise(
         _check_units(name, y, r)
         if not turn:
             _check_turns(name, y - r)
+            _check_any_turns(name, y, r, alone=True)
     reference = np.full(len(y), np.median(y[known])) if r is None else r
     again = _again(y, known, reference, tiny)
     quantum = _quantum(y[known & ~again], int(known.sum()), tiny)
@@ -136,7 +137,7 @@ def column_noise(
         if r is not None:
             delay, remarks = _delay(name, y, r, fresh, turn)
         late = _shifted(reference, 0 if np.isnan(delay) else int(delay))
-        raw = _short(y - late, turn)
+        raw = _around(y - late, turn)
         used = fresh & np.isfinite(raw)
         if used.sum() < LEAST:
             why = f"{name} has fewer than {LEAST} samples with a reference that are not held"
@@ -147,16 +148,24 @@ def column_noise(
                 f"it in that unit; if it is in degrees and a turn is 2 pi, give --scale {name}=0.0174533 "
                 f"{name}_ref=0.0174533"
             )
+        if r is not None and not turn:
+            _check_any_turns(name, y[used], late[used])
         kept = np.clip(raw, *np.quantile(raw[used], [(1 - share) / 2, (1 + share) / 2]))
         slow, drift, rate, unsure = _drift(np.where(used, kept, nan), dt, tiny)
         left = raw - slow
         sigma, bound, uniform = _noise_left(left[used], quantum, share, tiny, drift)
-        moves, by_chance = _moves(late + slow, left[used], sigma, quantum, tiny)
+        grid = quantum, float(y[known][0])
+        moves, by_chance = _moves(late + slow, left[used], sigma, grid, tiny)
         held, held_rate = _held(again, moves & np.isfinite(t), by_chance)
         fresh = known & ~(again & moves) if held else fresh
     if moves.sum() < 0.5 * known.sum():
         remarks.append(f"{name} moves too little between samples for held ones to be told")
         held, held_rate = 0, 0.0
+    elif held and not quantum and _recurs(y[used], late[used], tiny) > 0.5:
+        remarks.append(f"{name} is rounded in uneven steps, so that held samples cannot be told")
+        held, held_rate = 0, 0.0
+    if r is not None:
+        remarks += _stairs(name, r, bound, tiny)
     if r is not None and not turn:
         remarks += _slope(name, y[used], late[used])
     correlations = _autocorrelation(left, used)
@@ -221,6 +230,14 @@ def _beyond(
 def _short(difference: np.ndarray, turn: float) -> np.ndarray:
     """Returns differences (n,), of angles the short way round; `turn` as in `column_noise`."""
     return difference - turn * np.rint(difference / turn) if turn else difference
+
+
+def _around(errors: np.ndarray, turn: float) -> np.ndarray:
+    """Returns errors (n,), those of angles within half a turn of their mean; `turn` as in `column_noise`."""
+    if not turn:
+        return errors
+    mean = np.angle(np.nansum(np.exp(2j * np.pi * errors / turn))) * turn / (2 * np.pi)
+    return mean + _short(errors - mean, turn)
 
 
 def _again(y: np.ndarray, known: np.ndarray, reference: np.ndarray, tiny: float) -> np.ndarray:
@@ -295,6 +312,31 @@ def _check_turns(name: str, error: np.ndarray) -> None:
         )
 
 
+def _check_any_turns(name: str, y: np.ndarray, r: np.ndarray, alone: bool = False) -> None:
+    """Raises `BadInput` if errors of a measurement (n,) jump by its range, there and back.
+
+    If it is `alone`, only where the range of the reference (n,) is another: then no delay makes such errors.
+    """
+    both = np.isfinite(y) & np.isfinite(r)
+    y, error = y[both], (y - r)[both]
+    if len(y) < LEAST:
+        return
+    jumps = np.abs(np.diff(error))
+    turn = float(np.median(jumps[jumps > jumps.max() / 2])) if jumps.any() else 0.0
+    # What is at the ends of its range alone, as a gripper is, is no angle, but for a heading in degrees.
+    middle = np.mean(np.abs(y - (y.min() + y.max()) / 2) < turn / 4)
+    spans = 0.75 * turn < np.ptp(y) < 1.1 * turn and (middle > 0.01 or abs(turn / 360 - 1) < 0.05)
+    spans &= not (alone and 0.75 * turn < np.ptp(r[both]) < 1.1 * turn)
+    off = np.abs(error - np.median(error)) > turn / 2
+    # Four of them are two excursions at least.
+    if spans and off.sum() >= 4 and np.std(_around(error, turn)) < np.std(error) / 4:
+        raise BadInput(
+            f"errors of {name} jump by about {turn:.3g}, the range of its values, there and back: if it is "
+            f"an angle, scale it to rad and give --turn {name}, or in Python what a whole turn is, as "
+            f"turn={{{name!r}: 360}}"
+        )
+
+
 def _slope(name: str, y: np.ndarray, r: np.ndarray) -> list[str]:
     """Returns a remark if a measurement changes more or less than its reference."""
     from scipy import stats
@@ -337,7 +379,7 @@ def _delay(
         error = error[fresh & np.isfinite(error)]
         if len(error) < LEAST:
             return np.inf
-        return _square_beside_lines(_short(error, turn))
+        return _square_beside_lines(_around(error, turn))
 
     most = min(LONGEST_DELAY, len(y) // 8)
     lags = np.arange(-most // 10, most + 1)
@@ -352,9 +394,14 @@ def _delay(
     beside, best = squares[[i - 1, i + 1]], max(squares[i], 1e-300)
     if not np.isfinite(beside).all():
         return nan, [f"{name} has too few samples with a reference for a delay to be told"]
-    # Twice the logarithm of the likelihood ratio of the next best delay.
-    sure = fresh.sum() * np.log(max(beside.min(), best) / best)
-    if sure < stats.chi2.isf(CHANCE, 1):
+
+    def sureness(apart: int) -> float:
+        """Returns twice the logarithm of the likelihood ratio of a delay so many samples apart."""
+        others = squares[[max(i - apart, 0), min(i + apart, len(lags) - 1)]]
+        return float(fresh.sum() * np.log(max(others.min(), best) / best))
+
+    sure, enough, within = sureness(1), stats.chi2.isf(CHANCE, 1), max(2, int(lags[i]) // 10)
+    if sure < enough and sureness(within) < enough:
         return nan, [f"{name}_ref moves too little or too evenly for a delay to be told"]
     if squares[i] > squares.min():
         return nan, [f"{name} may be more than {most} samples late: give a longer log"]
@@ -363,9 +410,12 @@ def _delay(
         return nan, [
             f"{name} is {-middle:.1f} samples earlier than its reference: its delay cannot be told"
         ]
+    if sure < enough:
+        told = max(0.0, float(lags[i]))
+        return told, [f"{name} is {told:.0f} samples late, to within {within}"]
     # The error of the vertex is about 1 / sqrt(sure) samples.
     if abs(middle - lags[i]) > max(0.25, 3 / np.sqrt(sure)):
-        more = float(max(np.ceil(middle), 0))
+        more = max(0.0, float(np.ceil(middle)))
         return more, [f"{name} is {middle:.1f} samples late, which is taken as {more:.0f}"]
     return float(lags[i]), []
 
@@ -397,8 +447,39 @@ def _quantum(values: np.ndarray, samples: int, tiny: float) -> float:
     return float(gaps.sum() / np.rint(gaps / step).sum())
 
 
+def _recurs(y: np.ndarray, r: np.ndarray, tiny: float) -> float:
+    """Returns the share of the measurements (n,) that are also those of another reference (n,).
+
+    Noise that is not rounded gives no value twice.
+    """
+    order = np.argsort(y)
+    y, r = y[order], r[order]
+    first = np.flatnonzero(np.append(True, np.diff(y) > tiny))
+    apart = np.maximum.reduceat(r, first) - np.minimum.reduceat(r, first)
+    counts = np.diff(np.append(first, len(y)))
+    return float(counts[apart > tiny].sum() / len(y))
+
+
+def _stairs(name: str, r: np.ndarray, bound: float, tiny: float) -> list[str]:
+    """Returns a remark if a reference (n,) stays and jumps on, by more than a tenth of the noise's bound."""
+    steps = np.diff(r[np.isfinite(r)])
+    jumps = np.abs(steps) > tiny
+    sizes = steps[jumps]
+    if len(sizes) < LEAST or np.median(np.abs(sizes)) <= bound / 10:
+        return []
+    stays = np.mean(~jumps[1:][jumps[:-1]])
+    on = np.mean(sizes[1:] * sizes[:-1] > 0)  # what jumps back and forth is no sampled motion
+    if min(stays, on) < 0.5:
+        return []
+    return [
+        f"{name}_ref stays the same from row to row and then jumps, mostly by "
+        f"{np.median(np.abs(sizes)):.3g}, as one that is sampled less often: this is in the errors, so leave "
+        "its repeated cells empty"
+    ]
+
+
 def _moves(
-    smooth: np.ndarray, left: np.ndarray, sigma: float, quantum: float, tiny: float
+    smooth: np.ndarray, left: np.ndarray, sigma: float, grid: tuple[float, float], tiny: float
 ) -> tuple[np.ndarray, float]:
     """Returns where a measurement would seldom be that before it if it is not held, and with which chance.
 
@@ -406,14 +487,15 @@ def _moves(
         smooth: (n,) reference, bias and drift.
         left: (k,) errors besides these; they are shuffled, scaled to the deviation `sigma`.
         sigma: standard deviation of the noise without the quantum.
-        quantum: to which measurements are rounded.
+        grid: the step to which measurements are rounded, 0 if they are not, and one of them.
         tiny: the rounding of floats.
     """
+    quantum, origin = grid
     rng, scale, times = np.random.default_rng(0), sigma / max(float(np.std(left)), tiny), 20
     same = np.zeros(len(smooth))
     for _ in range(times):
         y = smooth + scale * rng.choice(left, len(smooth))
-        y = np.rint(y / quantum) * quantum if quantum else y
+        y = np.rint((y - origin) / quantum) * quantum if quantum else y
         same[1:] += np.where(np.isnan(np.diff(y)), times, np.abs(np.diff(y)) <= tiny)
     same[0] = times
     repeated = same / times
@@ -441,7 +523,7 @@ def _held(again: np.ndarray, moves: np.ndarray, chance: float) -> tuple[int, flo
         # With at most that many held in a row, a longer row has one in it that is repeated by chance.
         by_chance = (1 - rate) * chance
         both = rate + by_chance
-        ratio = both - rate**most * (rate - (chance - by_chance)) / max(both, 1e-300) ** most
+        ratio = both - (rate / max(both, 1e-300)) ** most * (rate - (chance - by_chance))
         base = int((moves if most == 0 else row == most).sum())
         longer = int((row == most + 1).sum())
         ratio = min(max(ratio, 0.0), 1.0)
@@ -467,17 +549,18 @@ def _drift(error: np.ndarray, dt: float, tiny: float) -> tuple[np.ndarray, float
 
     n, known, persists, length = len(error), np.isfinite(error), False, 8
     while n // length >= 16 and not persists:
-        means = _means(error, length)
-        means -= means.mean()
-        correlation = (means[1:] @ means[:-1]) / max(means @ means, 1e-300)
-        enough = stats.norm.isf(CHANCE) / np.sqrt(len(means))
-        persists = bool(correlation > max(0.5, enough))
+        means, some = _means(error, length)
+        means = np.where(some, means - means[some].mean(), 0.0)
+        pairs = max(int(np.count_nonzero(some[1:] & some[:-1])), 1)
+        products, square = (means[1:] @ means[:-1]) / pairs, (means @ means) / some.sum()
+        enough = stats.norm.isf(CHANCE) / np.sqrt(pairs)
+        persists = bool(products > max(0.5, enough) * max(square, 1e-300))
         length *= 2
     if not persists or np.ptp(error[known]) < tiny:
         return np.full(n, error[known].mean()), 0.0, 0.0, False
     # 2,000 blocks are more than the turns of a drift that can be told.
     length = max(1, n // 2_000)
-    means, each = _means(error, length), length * dt
+    (means, _), each = _means(error, length), length * dt
     # Of white noise, by second differences, which a slope does not change; and of the mean of a block.
     sigma = np.sqrt(np.nanmean(np.diff(error, 2) ** 2) / 6 / (length * known.mean()))
     best = np.inf, 5, 0.0
@@ -508,12 +591,16 @@ def _drift(error: np.ndarray, dt: float, tiny: float) -> tuple[np.ndarray, float
     )
 
 
-def _means(values: np.ndarray, length: int) -> np.ndarray:
-    """Returns the means of blocks of that length, (n // length,), where there are values."""
+def _means(values: np.ndarray, length: int) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the means of blocks of that length, (n // length,), and which blocks have values (bool).
+
+    Those of the others are interpolated.
+    """
     blocks = values[: len(values) // length * length].reshape(-1, length)
     counts = np.isfinite(blocks).sum(axis=1)
     some = np.flatnonzero(counts)
-    return np.interp(np.arange(len(blocks)), some, np.nansum(blocks[some], axis=1) / counts[some])
+    means = np.nansum(blocks[some], axis=1) / counts[some]
+    return np.interp(np.arange(len(blocks)), some, means), counts > 0
 
 
 def _noise_left(

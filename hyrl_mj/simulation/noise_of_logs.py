@@ -186,6 +186,13 @@ def noise_from_log(
     rows = len(data[chosen[0]])
     if rows < LEAST:
         raise BadInput(f"{path} has {counted(rows, 'row')} of samples: give at least {LEAST}")
+    for name in chosen if at_rest else ():
+        tiny = 1e-9 * np.abs(data[name]).max()  # as in column_noise
+        if (np.diff(data[name]) > tiny).all():
+            raise BadInput(
+                f"{name} rises in each row of {path}, as a clock or a counter does, and nothing of a robot "
+                "at rest: choose the columns that are measured, as --columns x"
+            )
     times, place, step, remarks = _clock(path, data[clock[0]] if clock else None, rows, dt)
     if place[-1] > MOST:
         raise BadInput(
