@@ -128,6 +128,17 @@ def test_a_quantum_rounds_the_noisy_columns():
     assert np.array_equal(run.measured[:, :, 0], run.true[:-1, :, 0])
 
 
+@pytest.mark.parametrize("name", ["rover", "quadrotor"])
+def test_what_robots_with_inertia_move_while_a_sensor_is_late_is_allowed_for(name):
+    """Also where all inputs are in their middle, so that it goes straight on as fast as it can."""
+    task = get_task(name)
+    middle = hyrl_mj.from_callable(lambda o: np.full(len(o), len(task.input_levels) // 2), task)
+    loop, options = hyrl_mj.policies.PolicyController(middle), LoopSettings(quiet=True)
+    z0 = task.starts(200, np.random.default_rng(0))
+    run = closed_loop(task, loop, z0, Sensor.parse("delay 2"), settings=options)
+    assert run.length.max() > 20
+
+
 def test_a_turn_is_no_jump():
     assert np.abs(played("delay 1", task=CIRCLE, steps=150)[0]).max() <= 0.05 + 1e-9
 

@@ -265,7 +265,7 @@ class Task(ABC):
     @cached_property
     def moves(self) -> np.ndarray:
         """The largest change (p,) of each column of the measurement in one sample, as runs show it."""
-        return largest_moves(self)
+        return largest_moves(self, inertia=not self.kinematic)
 
     @cached_property
     def ends_well(self) -> bool:

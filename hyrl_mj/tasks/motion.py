@@ -30,6 +30,8 @@ NEARER = (0.05, 0.02, 0.005, 0.002, 0.0005)
 # Moves come close to the largest one, and do not reach it: where it depends smoothly on the state, those of
 # thousands of samples fall short of it by less than this share.
 MARGIN = 1e-3
+# Of robots with inertia one run in a thousand goes farther by some percent than all others.
+INERTIA = 0.05
 
 
 def begins_anew(task: Task, of_chart: bool = False) -> bool:
@@ -133,22 +135,26 @@ def _inputs(task: Task, n: int, rng: np.random.Generator) -> np.ndarray:
     return np.select([kind == 0, kind == 1], [drawn, corners], alternating)
 
 
-def largest_moves(task: Task) -> np.ndarray:
+def largest_moves(task: Task, inertia: bool = False) -> np.ndarray:
     """Returns the largest change (p,) of each column of the measurement in one sample, as runs show it.
 
     They start anywhere on the chart, under inputs at their limits or in their middle, which half of the runs
-    hold. What a collision or an end does is left out.
+    hold. Where a robot has inertia, how fast it becomes depends on where it starts and on the order of its
+    inputs: as many runs start where the task does, and a third of all changes its inputs at each sample.
+    What a collision or an end does is left out.
     """
     rng, chart, d = np.random.default_rng(0), task.chart, task.chart.dimension
     z = chart.draw(4 * RUNS, rng)
     z = z[task.goes_on(z)][:RUNS]
+    z = np.vstack([z, task.starts(RUNS, rng)]) if inertia else z
     active, largest = np.arange(len(z)), np.zeros(len(task.noisy))
     plant, (low, high) = task.placed(z, rng), task.input_limits
-    u, changes = np.zeros((len(z), len(low))), active % 2 == 0
+    u, kind = np.zeros((len(z), len(low))), active % (3 if inertia else 2)
     for k in range(task.max_steps):
-        if k % HELD == 0:
+        if inertia or k % HELD == 0:
             drawn = low + (high - low) * rng.integers(3, size=u.shape) / 2
-            u = np.where(changes[:, None] | (k == 0), drawn, u)
+            changes = (k == 0) | (kind == 2) | ((kind == 0) & (k % HELD == 0))
+            u = np.where(changes[:, None], drawn, u)
         before = plant.measurement
         plant.step(u[active], active)
         after, unstable = plant.measurement, plant.unstable
@@ -157,4 +163,4 @@ def largest_moves(task: Task) -> np.ndarray:
         change = after[active] - before[active]
         change[:, :d] = chart.difference(after[active, :d], before[active, :d])
         largest = np.maximum(largest, np.abs(change).max(axis=0, initial=0.0))
-    return (1 + MARGIN) * largest
+    return (1 + (INERTIA if inertia else MARGIN)) * largest
