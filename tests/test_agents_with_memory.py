@@ -315,6 +315,24 @@ def test_an_attack_asks_and_changes_no_memory(puck):
         np.testing.assert_allclose(run.u[:end, row], expected, rtol=0, atol=1e-6)
 
 
+def test_agents_whose_memory_shows_late_are_not_taken_for_each_other(vehicle):
+    class Held:
+        """Holds its first level for some samples."""
+
+        def __init__(self, samples):
+            self.samples = samples
+
+        def start(self, n):
+            return np.zeros((n, 2))
+
+        def act(self, memory, observation):
+            level = np.where(memory[:, 0] % self.samples, memory[:, 1], 4 * (observation[:, 2] > 0))
+            return level.astype(int), np.column_stack([memory[:, 0] + 1, level])
+
+    held = {read_agent(vehicle, Held(samples)).agent.sha256 for samples in (5, 6, 9, 20, 30)}
+    assert len(held) == 5
+
+
 def test_a_run_backward_has_no_memory(circle):
     policy = from_callable(Chunked(), circle)
     settings = LoopSettings(steps=6, backward=True, record=True, quiet=True)
