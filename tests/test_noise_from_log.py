@@ -540,3 +540,11 @@ def test_a_file_with_other_signs_between_its_cells_says_so(tmp_path):
     path.write_text(path.read_text().replace(",", ";").replace(".", ","))
     with pytest.raises(BadInput, match="has ';' between its names: give commas between cells"):
         noise_from_log(path)
+
+
+def test_empty_cells_are_lost_whatever_the_quantum_hides(of):
+    noise = of(planted(0, 0.1, uniform=0.12, quantum=0.08, hold=(3, 0.2), lost=True))
+    assert noise.held == 3
+    assert noise.held_rate == pytest.approx(0.2, rel=0.1)
+    resting = planted(0, 0.05, amplitude=0.0, uniform=0.05, hold=(2, 0.2), lost=True)
+    assert of(resting).held == 2

@@ -164,6 +164,10 @@ def column_noise(
     elif held and not quantum and _recurs(y[used], late[used], tiny) > 0.5:
         remarks.append(f"{name} is rounded in uneven steps, so that held samples cannot be told")
         held, held_rate = 0, 0.0
+    # Cells that are empty are lost, whatever moves, and however it is rounded.
+    lost = ~known & np.isfinite(t) & (np.arange(len(y)) > np.argmax(known))
+    if lost.any() and (most := _held(lost, np.isfinite(t), 0.0))[0] >= held:
+        held, held_rate = most
     if r is not None:
         remarks += _stairs(name, r, bound, tiny)
     if r is not None and not turn:
