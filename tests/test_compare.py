@@ -697,6 +697,12 @@ def test_seeds_that_an_alternative_lacks_are_told(three):
     assert "all tried, none in 2 of 3 seeds" in cells["Policy"]
 
 
+def test_what_lacks_the_hard_seeds_is_no_better_for_it(three):
+    rows = [row("hyrl", 0, 1.0), row("hyrl", 1, 0.5), row("stack", 0, 0.99), row("noise", 1, 0.6)]
+    found = replace(three, rows=tuple(rows))
+    assert ranked(found) == ["noise", "hyrl", "stack"]
+
+
 def test_a_tie_is_one_and_starts_that_were_tried_have_an_error():
     rows = [row(name, s, 0.9, attacked=100.0) for name in ("hyrl", "stack") for s in range(3)]
     found = Compared("vehicle", 0.1, "fast", {}, True, tuple(rows))

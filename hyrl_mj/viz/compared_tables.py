@@ -31,9 +31,20 @@ def ranked(compared: Compared) -> list[str]:
 
 
 def _middle(compared: Compared, name: str, figure: str) -> float:
-    """Returns the mean of a figure over the seeds, -1 if there is none."""
-    values = compared.values(name, figure)
-    return float(np.mean(values)) if values else -1.0
+    """Returns the mean of a figure over the seeds, -1 if there is none.
+
+    An alternative that lacks seeds may lack those that are hard: it is as far from HyRL as in the seeds that
+    both have.
+    """
+    own, hyrl = (
+        {row.seed: row.figures[figure] for row in compared.of(n) if figure in row.figures}
+        for n in (name, "hyrl")
+    )
+    both = own.keys() & hyrl.keys()
+    if not both:
+        return float(np.mean([*own.values()])) if own else -1.0
+    apart = np.mean([own[seed] - hyrl[seed] for seed in both])
+    return round(float(apart + np.mean([*hyrl.values()])), 12)
 
 
 def result_table(compared: Compared, brief: bool = False) -> Table:
