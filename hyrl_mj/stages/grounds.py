@@ -371,11 +371,11 @@ class ByEpisodes(Episodes):
 
     The score is the number of plays that stop few episodes (`may_break`) before one stops more, then minus
     the mean share that these and that one stop: an episode that no policy wins hides no others. If none is
-    stopped an attack follows: a bias of its whole length is what few episodes draw. Then the score is minus the
-    share that it breaks, or if it breaks none, minus the largest distance from the set-point at the end
-    without noise, as a multiple of `allowed`. That is what a training aims at; for another one to follow a task
-    has to ask for a `precision`. The mirror image of a policy that wins all of its own mode has been judged
-    there, so the first three batches tell.
+    stopped an attack follows: a bias of its whole length is what few episodes draw. Then the score is minus
+    the share that it breaks, or if it breaks none, minus the largest distance from the set-point at the end
+    without noise, as a multiple of `allowed`. That is what a training aims at; for another one to follow a
+    task has to ask for a `precision`. The mirror image of a policy that wins all of its own mode has been
+    judged there, so the first three batches tell.
 
     What is reported comes from the attack of the examination: other starts, another seed, more rounds.
 
