@@ -495,9 +495,9 @@ def test_settings_and_the_code_of_a_notebook_are_written_down_for_each_process()
         return settings_of(env), code_of(env, lambda: radius)
 
     one, other = of(0.25), of(0.05)
-    assert [name for name in one[0] if one[0][name] != other[0][name]] == ["attribute config"]
-    assert b"here" in one[0]["attribute config"]
-    assert b"map" not in one[0]["attribute config"]
+    assert [name for name in one[0] if one[0][name] != other[0][name]] == ["config"]
+    assert b"here" in one[0]["config"]
+    assert b"map" not in one[0]["config"]
     assert one == of(0.25)
     assert one[1] == other[1] != of(0.25, "return True")[1]
 

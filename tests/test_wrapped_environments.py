@@ -40,8 +40,9 @@ from gymnasium.wrappers import (
 from planted import without_judges
 
 from hyrl_mj import BadInput, Noise, closed_loop, from_callable, from_gymnasium, simulate
+from hyrl_mj.gym_import import trials
 from hyrl_mj.gym_import.opening import Description
-from hyrl_mj.gym_import.uses import check_told
+from hyrl_mj.gym_import.pool import Pool
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.simulation import LoopSettings, Programmes, Recorded, Rules
 
@@ -86,6 +87,7 @@ class Telling(Flat):
             "parts": ("puck", complex(*place)),
             "tensors": [torch.tensor(place)],
             "ahead": True,
+            "ask": lambda: place,
         }
         if place[0] < -1.2:
             del told["ahead"]
@@ -157,39 +159,27 @@ def by(what, look):
     return lambda: By(telling(what), look)
 
 
-PAST = "a wrapper of .* observes .*{}.* does not reach"
-HELD = "a wrapper of .* observes .*{}.*, which follows the place"
-REFUSED = {
-    "info": (by("x", lambda env, *rest: rest[-1].get("x", -1.4)), PAST.format("info x")),
-    "the last info": (lambda: ByLastInfo(telling("x")), PAST.format("info x")),
-    "a word": (by("side", lambda env, *rest: rest[-1]["side"] == "left"), PAST.format("info side")),
-    "an entry of a list": (
-        by("bodies", lambda env, *rest: rest[-1]["bodies"][0]["at"]), HELD.format("info bodies"),
-    ),
-    "keys": (
-        by("cells", lambda env, *rest: next(iter(rest[-1]["cells"]))[0] / 5), HELD.format("info cells"),
-    ),
-    "complex": (by("parts", lambda env, *rest: rest[-1]["parts"][1].real), HELD.format("info parts")),
-    "tensors": (by("tensors", lambda env, *rest: rest[-1]["tensors"][0]), HELD.format("info tensors")),
-    "an entry that is missing": (
-        by("ahead", lambda env, *rest: "ahead" in rest[-1]), HELD.format("info ahead"),
-    ),
-    "an attribute": (by("pose", lambda env, *_: env.unwrapped.pose), PAST.format("attribute pose")),
-    "a truth": (by("above", lambda env, *_: env.unwrapped.above), PAST.format("attribute above")),
-    "an object": (
-        by("robot", lambda env, *_: env.unwrapped.robot.place), HELD.format(r"attribute robot\.place"),
-    ),
-    "slots": (
-        by("slotted", lambda env, *_: env.unwrapped.slotted.place), HELD.format(r"attribute slotted\.place"),
-    ),
-    "the reward": (lambda: By(Flat(), lambda env, reward, *_: reward), PAST.format("the reward")),
-    "the place before": (lambda: Before(Flat()), "has read from MuJoCo's state before it stepped"),
-    "a copy": (lambda: Copying(Flat()), "copies the environment, and noise reaches no copies"),
-}  # fmt: skip
-
-
-# Of what is told in other ways the one trial is made that finds it.
-WHOLE = "info", "the place before", "a copy"
+TOLD = r"a wrapper of .* shows in observation\[[01]\], after \d+ sample\(s\), more of where the robot is"
+WAYS = {
+    "info": by("x", lambda env, *rest: rest[-1].get("x", -1.4)),
+    "the last info": lambda: ByLastInfo(telling("x")),
+    "a word": by("side", lambda env, *rest: rest[-1]["side"] == "left"),
+    "an entry of a list": by("bodies", lambda env, *rest: rest[-1]["bodies"][0]["at"]),
+    "keys": by("cells", lambda env, *rest: next(iter(rest[-1]["cells"]))[0] / 5),
+    "complex": by("parts", lambda env, *rest: rest[-1]["parts"][1].real),
+    "tensors": by("tensors", lambda env, *rest: rest[-1]["tensors"][0]),
+    "an entry that is missing": by("ahead", lambda env, *rest: "ahead" in rest[-1]),
+    "a function": by("ask", lambda env, *rest: rest[-1]["ask"]()),
+    "an attribute": by("pose", lambda env, *_: env.unwrapped.pose),
+    "a truth": by("above", lambda env, *_: env.unwrapped.above),
+    "an object": by("robot", lambda env, *_: env.unwrapped.robot.place),
+    "slots": by("slotted", lambda env, *_: env.unwrapped.slotted.place),
+    "the reward": lambda: By(Flat(), lambda env, reward, *_: reward),
+    "the state": by("", lambda env, *_: env.unwrapped.data.qpos),
+    "a cell": by("", lambda env, *_: np.round(env.unwrapped.data.qpos)),
+    "derived quantities": lambda: Placed(Flat()),
+    "the place before": lambda: Before(Flat()),
+}
 
 
 @pytest.fixture(scope="module")
@@ -198,17 +188,17 @@ def telling_nothing():
     return from_gymnasium(by("", lambda *_: []), steps=20).specification
 
 
-@pytest.mark.parametrize("way", REFUSED)
+@pytest.mark.parametrize("way", WAYS)
 def test_wrappers_that_observe_the_place_past_the_noise_are_refused(way, telling_nothing, judged):
-    def look(make):
-        if way in WHOLE:
-            from_gymnasium(make, steps=20)
-        else:
-            check_told(replace(telling_nothing, description=Description(make, steps=20)))
+    pool = Pool(Description(WAYS[way], steps=20))
+    pool.learn(replace(telling_nothing, description=pool.spec.description))
+    with pytest.raises(BadInput, match=TOLD):
+        trials.check_noise(pool)
 
-    make, message = REFUSED[way]
-    with pytest.raises(BadInput, match=message):
-        look(make)
+
+def test_wrappers_that_copy_the_environment_are_refused():
+    with pytest.raises(BadInput, match="copies the environment, and noise reaches no copies"):
+        from_gymnasium(lambda: Copying(Flat()), steps=20)
 
 
 class Fixes(gym.Wrapper):
@@ -228,10 +218,6 @@ class Fixes(gym.Wrapper):
         return np.append(observation[:4], self.fix), *rest
 
 
-class Seldomer(Fixes):
-    every = 70
-
-
 class Placed(gym.ObservationWrapper):
     """Shows where the body is, which the environment computes a physics step before the end of a step."""
 
@@ -239,39 +225,10 @@ class Placed(gym.ObservationWrapper):
         return np.append(self.unwrapped.data.body("puck").xpos[:2], observation[2:])
 
 
-def test_what_wrappers_read_of_the_state_at_any_time_is_under_noise_or_refused():
-    assert from_gymnasium(lambda: Fixes(Flat()), steps=60).specification.sensing == "now"
-    assert from_gymnasium(lambda: Placed(Flat()), steps=20).specification.sensing == "earlier"
-    task = from_gymnasium(lambda: Seldomer(Flat()), steps=80)
-    assert not task.specification.sensing  # no trial is so long
-    with pytest.raises(BadInput, match=r"has read from MuJoCo's state .* or reads seldom"):
+def test_wrappers_that_read_the_place_seldom_are_refused_in_runs():
+    task = from_gymnasium(lambda: Fixes(Flat()), steps=60)  # no trial is so long
+    with pytest.raises(BadInput, match=r"shows in observation\[4\], after 45 sample"):
         simulate(task, always(task, 0, 0), [-1.4, 0.5], Noise("uniform", 0.1))
-
-
-class Ranging(gym.ObservationWrapper):
-    """Observes the distance of the goal, which it reads from MuJoCo's state."""
-
-    def __init__(self, env):
-        super().__init__(env)
-        self.observation_space = numbers(7)
-
-    def observation(self, observation):
-        return np.append(observation, np.linalg.norm(self.unwrapped.data.qpos - GOAL))
-
-
-class RangingJudge(Ranging):
-    def step(self, action):
-        observation, reward, terminated, truncated, info = super().step(action)
-        info["success"] = bool(observation[-1] < 0.25)
-        return observation, reward, terminated, truncated, info
-
-
-def test_what_wrappers_observe_of_the_state_is_under_noise():
-    task = from_gymnasium(lambda: Ranging(Flat()), steps=5)
-    noise = np.zeros((6, 1, len(task.noisy)))
-    noise[:, :, 0] = 0.1
-    (arc,) = simulate(task, always(task, 0, 0), [[-1.0, 0.0]], Recorded(noise, 0.1))
-    assert arc.measured[0, 2 + 6] == pytest.approx(2.4, abs=1e-5)
 
 
 class OnTheLastStep(gym.Wrapper):
@@ -298,7 +255,6 @@ class Steered(gym.Wrapper):
 @pytest.mark.parametrize(
     ("make", "noise", "steps", "message"),
     [
-        (lambda: RangingJudge(Flat()), 0.2, 60, r"sample\(s\) it is .*, and .* in the new one"),
         (lambda: Steered(Flat()), 0.2, 60, "running without the noise, which must not judge"),
         (
             lambda: OnTheLastStep(TimeLimit(Flat(), 10)), 0.0, None,

@@ -1,31 +1,23 @@
-"""Values that an environment holds in `info` and attributes: found by name, and set."""
+"""Numbers and texts that an environment holds in attributes: found by name, and set."""
 
 from __future__ import annotations
 
 import copyreg
 import os
-import pickle
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Set
 from contextlib import suppress
 from numbers import Number
-from types import BuiltinFunctionType
 from typing import Any
 
 import numpy as np
 
-from hyrl_mj.gym_import.fingerprint import (
-    DEEPEST,
-    FUNCTIONS,
-    GENERATORS,
-    has_no_memory,
-    is_of_torch,
-)
+from hyrl_mj.gym_import.fingerprint import DEEPEST, FUNCTIONS, has_no_memory, is_of_torch
 from hyrl_mj.gym_import.opening import physics_of
 
 
-def held(inner: Any, info: dict[str, Any]) -> Iterator[tuple[str, Any, Any]]:
-    """Yields name, owner and key of values in `info` and in attributes, also within objects.
+def held(inner: Any) -> Iterator[tuple[str, Any, Any]]:
+    """Yields name, owner and key of numbers and texts in attributes, also within objects.
 
     Views of MuJoCo's arrays are left out, as what they show is its state.
     What an owner holds, `value_at` gives.
@@ -33,8 +25,7 @@ def held(inner: Any, info: dict[str, Any]) -> Iterator[tuple[str, Any, Any]]:
     seen, (_, data) = {id(inner)}, physics_of(inner) or (None, None)
     begins = data.qpos.ctypes.data if data else 0
     state = range(begins, begins + (data.nbuffer if data else 0))  # where MuJoCo keeps it
-    for kind, owner in (("info", info), ("attribute", getattr(inner, "__dict__", {}))):
-        yield from _within(owner, f"{kind} ", seen, state, 0)
+    yield from _within(getattr(inner, "__dict__", {}), "", seen, state, 0)
 
 
 def _within(
@@ -83,43 +74,37 @@ def put_at(owner: Any, key: Any, value: Any) -> None:
             setattr(owner, key, value)
 
 
-def taken_apart(value: Any) -> tuple[np.ndarray, Any] | None:
-    """Returns the numbers (k,) that a value holds, and what is left of it, to compare it.
-
-    None of what holds an object with attributes, a function, or something that cannot be written down.
-    """
-    numbers = list[np.ndarray]()
+def taken_apart(value: Any) -> tuple[np.ndarray, list[str]] | None:
+    """Returns the numbers (k,) and the texts that a value holds; None of what holds something else."""
+    found = list[Any]()
     try:
-        rest = _rest(value, numbers)
-    except Exception:  # whatever a foreign class raises
+        _take(value, found)
+    except TypeError:
         return None
-    return np.concatenate([np.empty(0), *numbers]), rest
+    texts = [part for part in found if isinstance(part, str)]
+    return np.array([part for part in found if not isinstance(part, str)], dtype=float), texts
 
 
-def _rest(value: Any, numbers: list[np.ndarray]) -> Any:
-    """Returns what is left of a value without its numbers, which are added to a list of arrays (k,)."""
+def _take(value: Any, found: list[Any]) -> None:
+    """Adds the numbers and texts of a value to a list; raises TypeError if it holds something else."""
     if is_of_torch(value, "Tensor"):
         value = value.detach().cpu().numpy()
-    if isinstance(value, Number) and not isinstance(value, complex | np.generic):
-        value = np.array(float(value))  # type: ignore[arg-type]
-    if isinstance(value, complex | np.generic | np.ndarray):
-        array = np.asarray(value)
-        if array.dtype.kind in "biufc":
-            is_complex = array.dtype.kind == "c"
-            flat = np.stack([array.real, array.imag], axis=-1) if is_complex else array
-            numbers.append(flat.ravel().astype(float))
-            return array.shape
-        return [array.shape, _rest(array.ravel().tolist(), numbers)]
+    if isinstance(value, np.ndarray) and value.dtype.kind in "biufcSU":
+        value = value.ravel().tolist()
     if isinstance(value, dict):
-        return [(_rest([key], []), key, _rest(part, numbers)) for key, part in value.items()]
+        found += [key for key in value if isinstance(key, str)]
+        value = [*value.values()]
     if isinstance(value, list | tuple | deque):
-        return [_rest(part, numbers) for part in value]
-    if isinstance(value, Set):
-        return [frozenset(value), _rest([*value], [])]
-    has_more = isinstance(value, (FUNCTIONS, BuiltinFunctionType, *GENERATORS)) or _slots(value)
-    if has_more or hasattr(value, "__dict__") or has_no_memory(value):
-        raise TypeError("it is more than a value")
-    return value if isinstance(value, str | bytes | None) else pickle.dumps(value)
+        for part in value:
+            _take(part, found)
+    elif isinstance(value, Set):
+        found += sorted(part for part in value if isinstance(part, str))
+    elif isinstance(value, complex):
+        found += value.real, value.imag
+    elif isinstance(value, str | Number):
+        found.append(value)
+    elif not isinstance(value, bytes | None | np.bool_):
+        raise TypeError
 
 
 def settings_of(env: Any) -> dict[str, bytes]:
@@ -129,18 +114,12 @@ def settings_of(env: Any) -> dict[str, bytes]:
     are left out.
     """
     found = {}
-    for name, owner, key in held(env, {}):
-        numbers, rest = taken_apart(value_at(owner, key)) or (np.empty(0), None)
+    for name, owner, key in held(env):
+        numbers, texts = taken_apart(value_at(owner, key)) or (np.empty(0), [])
+        words = [text for text in texts if os.sep not in text]
         with np.errstate(over="ignore"):
-            found[name] = ascii(_texts(rest)).encode() + numbers.astype("<f4").tobytes()
+            found[name] = ascii(words).encode() + numbers.astype("<f4").tobytes()
     return found
-
-
-def _texts(rest: Any) -> list[str]:
-    """Returns the texts in what is left of a value, but for names of files."""
-    if isinstance(rest, str):
-        return [] if os.sep in rest else [rest]
-    return [t for part in rest for t in _texts(part)] if isinstance(rest, list | tuple) else []
 
 
 def numbers_of(value: Any) -> np.ndarray | None:
@@ -171,9 +150,9 @@ def put_numbers(owner: Any, key: Any, numbers: np.ndarray) -> None:
 
 
 def _numbers(inner: Any) -> Iterator[tuple[str, Any, Any, np.ndarray]]:
-    for name, owner, key in held(inner, {}):
+    for name, owner, key in held(inner):
         if (numbers := numbers_of(value_at(owner, key))) is not None:
-            yield name.removeprefix("attribute "), owner, key, numbers
+            yield name, owner, key, numbers
 
 
 def like(old: Any, numbers: Iterable[Any]) -> Any:
@@ -181,20 +160,15 @@ def like(old: Any, numbers: Iterable[Any]) -> Any:
     numbers = iter(numbers)
     if isinstance(old, dict):
         return {key: like(part, numbers) for key, part in old.items()}
-    if isinstance(old, tuple) and hasattr(old, "_fields"):
-        return type(old)(*(like(part, numbers) for part in old))
     if isinstance(old, list | tuple | deque):
-        return type(old)(like(part, numbers) for part in old)
+        parts = [like(part, numbers) for part in old]
+        return type(old)(*parts) if hasattr(old, "_fields") else type(old)(parts)
     if is_of_torch(old, "Tensor"):
         return old.new_tensor(like(old.detach().cpu().numpy(), numbers))
     if isinstance(old, np.ndarray):
-        if old.dtype.kind not in "biufc":
-            found = old.copy()
-            found.ravel()[:] = like(old.ravel().tolist(), numbers)
-            return found
-        values = np.array([like(one, numbers) for one in old.ravel().tolist()]).reshape(old.shape)
+        values = np.array(like(old.ravel().tolist(), numbers)).reshape(old.shape)
         return values if _are_parts(values, old.dtype) else values.astype(old.dtype)
-    if isinstance(old, complex | np.complexfloating):
+    if isinstance(old, complex):
         return type(old)(complex(next(numbers), next(numbers)))
     if not isinstance(old, Number):
         return old

@@ -206,39 +206,19 @@ def _changed_by_user(instance: Instance) -> set[str]:
 
 
 def _check_pins(instance: Instance) -> None:
-    """Raises `BadInput` if a pinned attribute contradicts what is drawn where the attribute was.
+    """Raises `BadInput` if a value pins an attribute, of which what a seed pins may be a copy.
 
-    An attribute that, after each reset, is a copy of a place in the model or in the state is one after the
-    resets that pin it, too.
+    Such a copy, as the place of a site, would stay where the seed puts it.
     """
-    pinned, inner = instance.spec.description.pinned, instance.inner
-    pins = {n: np.ravel(v).astype(float) for n, v in pinned.items() if hasattr(inner, n)}
-    if not pins:
-        return
-    drawn = []
-    for seed in range(COMPARED):
+    description, seen = instance.spec.description, list[Fingerprint]()
+    for seed in range(COMPARED if description.seed is not None else 0):
         instance.reset(seed, plain=True)
-        drawn.append({n: np.ravel(getattr(inner, n)).copy() for n in pins} | _places(instance))
+        seen.append(instance.memory())
     instance.reset()
-    for name, pin in pins.items():
-        if all(np.array_equal(one[name], drawn[0][name]) for one in drawn):
-            continue  # no reset draws it
-        for place, now in _places(instance).items():
-            copies = all(np.array_equal(one[name], one[place][: len(pin)]) for one in drawn)
-            if copies and not np.array_equal(pin, now[: len(pin)]):
-                raise BadInput(
-                    f"pinned {name} is {pin.tolist()}, and {place} of {instance.name}, which each reset puts "
-                    f"at the same place, stays at {now[: len(pin)].tolist()}: pin it by options of reset or "
-                    "by a seed"
-                )
-
-
-def _places(instance: Instance) -> dict[str, np.ndarray]:
-    """Returns places of the model and of the state by name, each as numbers (k,)."""
-    model, data = instance.model, instance.data
-    kinds = {"site_pos": model, "body_pos": model, "geom_pos": model, "mocap_pos": data}
-    found = {f"qpos[{i}:]": data.qpos[i:].copy() for i in range(model.nq)}
-    for kind, owner in kinds.items():
-        rows = np.reshape(getattr(owner, kind), (-1, 3)).copy()
-        found |= {f"{kind}[{i}]": row for i, row in enumerate(rows)}
-    return found
+    drawn = {name.partition("[")[0] for one in seen for name in differing(one, seen[0])}
+    if both := [name for name in description.pinned if name in drawn]:
+        raise BadInput(
+            f"{both[0]} of {instance.name}, which resets draw, is pinned by a value, and what else they draw "
+            "by a seed, where copies of it may stay, as in the model: pin it by options of reset, or by "
+            "another seed"
+        )

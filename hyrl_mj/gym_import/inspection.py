@@ -41,7 +41,7 @@ from hyrl_mj.gym_import.pool import Pool
 from hyrl_mj.gym_import.resets import SAME, resets_of, violation_of
 from hyrl_mj.gym_import.specification import Criterion
 from hyrl_mj.gym_import.starts import VIOLATED, check_noted
-from hyrl_mj.gym_import.uses import check_copied, check_told, check_use, senses
+from hyrl_mj.gym_import.uses import check_copied, check_use
 from hyrl_mj.physics import memory, mjcf
 from hyrl_mj.sets import Chart
 
@@ -104,9 +104,6 @@ def inspect(description: Description, untried: bool = False) -> tuple[Pool, Inst
     if late:
         instance.spec.found["lag"] = f"observation {', '.join(map(str, late))} {LAG[derived]}"
     instance.learn(derived=derived)
-    if instance.is_wrapped:
-        check_told(instance.spec)
-        instance.learn(sensing=senses(instance.spec))
     instance.learn(led=check_noted(instance.spec, resets))
     pool.learn(instance.spec)
     moves, at_rest = trials.moving(pool)

@@ -23,7 +23,7 @@ from gymnasium import spaces
 from hyrl_mj.errors import BadInput, HyrlError, brief
 from hyrl_mj.gym_import import fingerprint as written
 from hyrl_mj.gym_import.expressions import entry
-from hyrl_mj.gym_import.observations import columns_of, flat, observers, parts_of, shaped
+from hyrl_mj.gym_import.observations import flat, observers, shaped
 from hyrl_mj.gym_import.opening import (
     actions_of,
     checked_step,
@@ -47,6 +47,17 @@ class Seen(NamedTuple):
     report: Sequence[float]
 
 
+class Passed(NamedTuple):
+    """What the innermost environment and its wrappers pass to each other in a sample.
+
+    The action is None of a reset, which has no ends, else `terminated` and `truncated`.
+    """
+
+    action: Any
+    observation: Any
+    ends: tuple[Any, ...]
+
+
 # What is put before names of parts of MuJoCo's state, among those of what is remembered.
 OF_STATE = "MuJoCo's "
 
@@ -67,15 +78,14 @@ class Instance:
         inner_seen: what the innermost environment observed last.
         draws_globally: whether a reset has drawn from a global generator.
         start: the state of MuJoCo to which the innermost reset has to lead, below wrappers.
-        tamper: changes, in a trial, all but the observation before wrappers get it; these may then write to a
-            state that noise has moved, too.
+        passed: what has passed between the innermost environment and its wrappers since the start.
+        script: in a trial, what passes instead: the actions of each sample.
+        is_told: whether, in a trial, wrappers also get the observations and ends of the script.
         lead: in a trial, is told of each line of Python that a reset takes, as by `sys.settrace`, and of its
             end.
         own: for one that goes on from episode to episode as its user's does: the places in a state of what a
             start decides. All else is as its resets leave it, and after the first these have a seed only
             where what they draw is pinned by it.
-        veiled: whether, in a trial, wrappers see MuJoCo's state where the last noise showed the robot
-            before they step the environment, too.
 
     Raises:
         BadInput: it cannot be made or reset.
@@ -98,13 +108,7 @@ class Instance:
         self._left_out = ", ".join(name for name in names if name not in kept)
         self.is_wrapped = self.env is not self.inner
         self._space, self._actions = self.env.observation_space, actions_of(self.env)
-        self._columns, parts = int(spaces.flatdim(self._space)), parts_of(self._space)
-        # Types in which what is observed may be another number, and their columns.
-        self._kinds = [
-            (parts[name].dtype, at)
-            for name, at in columns_of(self._space).items()
-            if parts[name].dtype not in (np.float32, np.float64)
-        ]
+        self._columns = int(spaces.flatdim(self._space))
         self._observers = observers(self.env)
         self.observation, self.inner_seen = np.empty(0), None
         numbers = 4 + len(spec.criterion.keys) + len(spec.criterion.points)
@@ -116,9 +120,9 @@ class Instance:
         self.own: np.ndarray | None = None
         self._samples = 0
         self._placed: mujoco.MjData | None = None
-        self.tamper: Callable[[tuple[Any, ...]], tuple[Any, ...]] | None = None
+        self.passed, self.is_told = list[Passed](), False
+        self.script: Iterator[Passed] = iter(())
         self.lead: Any = None
-        self.veiled, self._noise = False, np.empty(0)
         if self.is_wrapped:
             self._put_in()
 
@@ -233,6 +237,7 @@ class Instance:
             self.lead.end()
         self.physics.write(state)
         self.inner_seen, self._at_start, self._samples = self.watched(), True, 0
+        self.passed = []
 
     def pin(self) -> None:
         """Sets what is pinned."""
@@ -286,8 +291,6 @@ class Instance:
         if self._thread is None:
             self.take(self.stepped(u))
         else:
-            if self.veiled and self._noise.any():
-                self._show(self._noise)
             self._ask(lambda: self.stepped(u))
 
     def sense(self, noise: np.ndarray | None = None) -> None:
@@ -343,8 +346,6 @@ class Instance:
         self._own_step, self._own_reset = inner.step, inner.reset
         self._resetting = False  # its own reset may step it
         self._calls = 0  # of the step, in a sample
-        # The state that wrappers see, if it is not the true one.
-        self._shown: np.ndarray | None = None
         try:
             inner.step, inner.reset = self._inner_step, self._inner_reset
         except Exception as error:
@@ -367,37 +368,16 @@ class Instance:
     def _answer(self, noise: np.ndarray | None) -> Any:
         """Goes on with noise (d,) to the end of the step or reset, and returns its result."""
         assert self._thread is not None
-        try:
-            result = self._thread.go_on(noise)
-        finally:
-            wrote = self._come_back()
-        if wrote and self.tamper is None:
-            raise BadInput(
-                f"a wrapper of {self.name} reads MuJoCo's state for what it observes, and writes to it: let "
-                "it observe what the environment gives it, or let only the environment write"
-            )
-        return result
-
-    def _come_back(self) -> bool:
-        """Puts the true state back if wrappers have seen another one; returns whether they wrote to it."""
-        if self._shown is None:
-            return False
-        now, shown, self._shown = self.physics.read(), self._shown, None
-        wrote = (now != shown) & ~(np.isnan(now) & np.isnan(shown))
-        self.physics.come_back()
-        if wrote.any():
-            state = self.physics.read()
-            state[wrote] = now[wrote]
-            self.physics.show(state)
-        return bool(wrote.any())
+        return self._thread.go_on(noise)
 
     def _inner_step(self, action: Any) -> Any:
-        self._come_back()
-        result = self._own_step(action)
         if self._resetting:
-            return result
+            return self._own_step(action)
+        told = next(self.script, None)
+        action = action if told is None else told.action
+        action, result = copy.deepcopy(action), self._own_step(action)
         self.inner_seen = copy.deepcopy(result[0])  # wrappers may change theirs in place
-        return self._observed(result[0], result[1:])
+        return self._observed(action, result[0], result[1:], told)
 
     def _inner_reset(self, **options: Any) -> Any:
         self._resetting = True
@@ -410,44 +390,29 @@ class Instance:
             return result
         self.pin()
         self.arrive(self.start)
-        return self._observed(copy.deepcopy(self.inner_seen), result[1:])
+        seen = copy.deepcopy(self.inner_seen)
+        return self._observed(None, seen, result[1:], next(self.script, None))
 
-    def _observed(self, observation: Any, rest: tuple[Any, ...]) -> tuple[Any, ...]:
+    def _observed(
+        self, action: Any, observation: Any, rest: tuple[Any, ...], told: Passed | None
+    ) -> tuple[Any, ...]:
         """Returns what wrappers get of a step or a reset: in a sample, after its noise is known."""
         assert self._thread is not None
-        if not self._thread.busy:
-            return (observation, *rest)
-        if self.tamper is not None:
-            rest = self.tamper(rest)
-        self._calls += 1
-        if self._calls > 1:
-            raise BadInput(
-                f"a wrapper of {self.name} steps or resets the environment more than once in a step, and "
-                "noise comes once a sample: give the environment a frame_skip instead"
-            )
-        noise = self._thread.pause()
-        if noise is not None and noise.any():
-            observation = self.displaced(noise)
-            if self.spec.sensing:
-                self._show(noise)
-        self._noise = np.empty(0) if noise is None else noise
+        if self._thread.busy:
+            self._calls += 1
+            if self._calls > 1:
+                raise BadInput(
+                    f"a wrapper of {self.name} steps or resets the environment more than once in a step, and "
+                    "noise comes once a sample: give the environment a frame_skip instead"
+                )
+            noise = self._thread.pause()
+            if noise is not None and noise.any():
+                observation = self.displaced(noise)
+        if self.is_told and told is not None:
+            observation = copy.deepcopy(told.observation)
+            rest = *rest[:-3], *told.ends, rest[-1]
+        self.passed.append(Passed(action, copy.deepcopy(observation), rest[-3:-1]))
         return (observation, *rest)
-
-    def _show(self, noise: np.ndarray) -> None:
-        """Puts MuJoCo to where noise (d,) shows the robot, for wrappers that observe its state."""
-        state = self.physics.read()
-        self.physics.leave()
-        self._put_to(self.spec.sensing or "now", state, noise)
-        self._shown = self.physics.read()
-
-    def _put_to(self, derived: Derived, state: np.ndarray, noise: np.ndarray) -> None:
-        """Puts MuJoCo into a state (S,) under noise (d,), with derived quantities as `derived` says."""
-        moved = self.moved(state, noise)
-        if derived == "earlier":
-            self.physics.write(self.moved(self.physics.earlier(state), noise))
-            self.physics.show(moved)
-        else:
-            self.physics.write(moved)
 
     # ---- what it observes
 
@@ -464,16 +429,6 @@ class Instance:
                 f"{self.name} observes {len(vector)} number(s), and its observation_space has "
                 f"{self._columns}: let them be as many"
             )
-        for part, at in self._kinds:
-            seen = vector[at]
-            with np.errstate(invalid="ignore"):
-                given = seen.astype(part).astype(float)
-            if (given != seen).any():
-                i = int((given != seen).argmax())
-                raise BadInput(
-                    f"{self.name} observes {seen[i]:.6g} in observation[{at.start + i}], whose space is of "
-                    f"{part}, so that SB3 shows agents {given[i]:.6g}: give it a space of float32 or float64"
-                )
         return vector
 
     def watched(self) -> Any:
@@ -511,7 +466,12 @@ class Instance:
     def seen_as(self, derived: Derived, state: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Returns the innermost observation (o,) of a state (S,) under noise (d,), as `derived` says."""
         self.physics.leave()
-        self._put_to(derived, state, noise)
+        moved = self.moved(state, noise)
+        if derived == "earlier":
+            self.physics.write(self.moved(self.physics.earlier(state), noise))
+            self.physics.show(moved)
+        else:
+            self.physics.write(moved)
         seen = flat(self.watched(), self.inner.observation_space)
         self.physics.come_back()
         return seen

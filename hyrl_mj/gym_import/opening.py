@@ -275,6 +275,11 @@ def _checked(env: Any, name: str) -> mujoco.MjModel:
                 f"{name} observes {what} {getattr(part, 'shape', '')}: hyrl_mj takes vectors, or a Dict of "
                 "vectors; choose the observation of its state"
             )
+        if part.dtype not in (np.float32, np.float64):
+            raise BadInput(
+                f"{name} observes numbers in a space of {part.dtype}, as which SB3 may show agents others: "
+                "give it a space of float32 or float64"
+            )
     actions = actions_of(env)
     if not isinstance(actions, spaces.Box | spaces.Discrete):
         raise BadInput(f"{name} takes actions of {actions}: hyrl_mj takes a Box, or Discrete")

@@ -190,8 +190,6 @@ class EnvironmentSpec:
             state, whatever their places.
         led: how runs that are judged are led to their starts; None where resets note nothing.
         derived: `Derived`.
-        sensing: how `derived` is shown to wrappers that read MuJoCo's state for what they observe, and see it
-            under noise; "" if none does.
         moves: (o,) bool, the columns of an observation at rest that follow the chart.
         at_rest: a matrix (t, o) that gives what is observed at rest at z from `terms` of z, if one does.
         found: what was filled in, with the reason, by name.
@@ -229,7 +227,6 @@ class EnvironmentSpec:
     recalled: np.ndarray = field(default_factory=_none)
     led: Any = None
     derived: Derived = "unknown"
-    sensing: Derived | Literal[""] = ""
     moves: np.ndarray = field(default_factory=_none)
     at_rest: np.ndarray | None = None
     found: dict[str, str] = field(default_factory=dict)

@@ -7,6 +7,7 @@ stepped, has to go and to end alike.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,14 +17,12 @@ from hyrl_mj.errors import BadInput
 from hyrl_mj.files import trust
 from hyrl_mj.gym_import import fingerprint as written
 from hyrl_mj.gym_import.coordinates import own_of
-from hyrl_mj.gym_import.instance import OF_STATE, Instance, outlasting
+from hyrl_mj.gym_import.instance import OF_STATE, Instance, Passed, outlasting
 from hyrl_mj.gym_import.specification import EnvironmentSpec
 from hyrl_mj.system import limits
 from hyrl_mj.tasks import Outcome
 
 Arrays = tuple[np.ndarray, ...]
-# Of so many runs that are judged one shows wrappers nothing but where the noise shows the robot.
-VEILED = 8
 # Runs of a judgement that an environment plays, too, which goes on from episode to episode; all of them where
 # something outlasts its resets.
 LIVED = 16
@@ -71,7 +70,7 @@ class Stage:
         self._judges: dict[bool, list[Instance]] = {True: [], False: []}
         self._lived: dict[bool, Instance] = {}  # which is never replaced
         self._wears = False  # whether something has outlasted a reset
-        self._veiled: list[Instance] = []
+        self._elsewhere: list[Instance] = []
         self._led: list[Instance] = []
         self._resting: Instance | None = None
         self._fresh: Instance | None = None  # which has only been reset
@@ -166,54 +165,52 @@ class Stage:
         for i, run in enumerate(runs):
             # A time limit of its own would end a run that is simulated for longer.
             as_it_is = len(run.inputs) <= self.spec.max_steps
-            self._judge(run, run.noise, as_it_is)
+            passed = self._judge(run, run.noise, as_it_is)
             if len(runs) > 1 and (i < LIVED or self._wears) and run.outcome != Outcome.UNSTABLE:
                 self._live(run, as_it_is)
             if self.spec.led is not None:
                 self._lead(run)
-            if not run.noise.any():
-                continue
-            alike = self._judge(run, np.zeros_like(run.noise), as_it_is)
-            if not self.spec.wrapped:
-                if not alike:
-                    raise BadInput(
-                        f"a run of {self.spec.name} goes or ends otherwise without the noise: step() goes by "
-                        f"what {self.spec.observer}() has noted where noise showed the robot, so let that "
-                        "method only read"
-                    )
-                continue
-            if not alike:
-                for part in _parts(run):
-                    without_last = part.noise.copy()
-                    without_last[len(part.inputs) :] = 0.0
-                    self._judge(part, without_last, as_it_is)
-            if i % VEILED == 0:
-                self._check_veiled(run)
+            if run.noise.any():
+                self._judge(run, np.zeros_like(run.noise), as_it_is, passed)
+            if run.noise.any() and self.spec.wrapped:
+                self._check_told(run, passed, i)
 
-    def _judge(self, run: Played, noise: np.ndarray, as_it_is: bool) -> bool:
-        """Plays a run in a new environment, as `judge` does, which has its time limit or not."""
+    def _judge(
+        self, run: Played, noise: np.ndarray, as_it_is: bool, script: Sequence[Passed] = ()
+    ) -> list[Passed]:
+        """Plays a run in a new environment, as `judge` does, which has its time limit or not.
+
+        Returns:
+            What has passed between it and its wrappers.
+        """
         real = self._renewed(self._judges[as_it_is], as_it_is)
-        alike = judge(run, real, noise, self._fresh)
+        real.script = iter(script)
+        judge(run, real, noise, self._fresh)
         self._judges[as_it_is].append(real)
-        return alike
+        return real.passed
 
-    def _check_veiled(self, run: Played) -> None:
-        """Raises `BadInput` if wrappers read MuJoCo's state at another time than is known."""
-        real = self._renewed(self._veiled)
-        real.learn(sensing=real.spec.sensing or "now")
-        real.veiled, real.tamper = True, tuple  # they may write there
-        veiled = real.play(run.start, run.inputs, run.noise)
-        for z, seen, other in zip(run.path, run.observations, veiled, strict=False):
-            there = real.spec.z(other.state[None])[0]
-            if other.report and not np.array_equal(z, there, equal_nan=True):
-                break  # a wrapper controls the robot by what it reads, or has written there
-            if not np.array_equal(seen, other.observation, equal_nan=True):
+    def _check_told(self, run: Played, passed: Sequence[Passed], seed: int) -> None:
+        """Raises `BadInput` if wrappers observe more of where the robot is than the environment observes.
+
+        They get what they got in a run, but in an environment whose robot is elsewhere.
+        """
+        other, chart = self._renewed(self._elsewhere), self.spec.chart
+        other.script, other.is_told, told = iter(passed), True, list[np.ndarray]()
+        place = np.random.default_rng(seed).uniform(chart.low, chart.high)
+        (start,) = self.spec.state_at(place[None])
+        with suppress(BadInput):  # it may not be able to go on from there
+            for sample in other.play(start, run.inputs, np.zeros_like(run.noise)):
+                told.append(sample.observation)
+        self._elsewhere.append(other)
+        for k, (seen, shown) in enumerate(zip(run.observations, told, strict=False)):
+            if not np.array_equal(seen, shown, equal_nan=True):
+                column = int(((seen != shown) & ~(np.isnan(seen) & np.isnan(shown))).argmax())
                 raise BadInput(
-                    f"a wrapper of {real.name} observes what it has read from MuJoCo's state before it "
-                    "stepped the environment, or reads seldom, and noise does not reach that: let it read "
-                    "after each step, and keep that"
+                    f"a wrapper of {self.spec.name} shows in observation[{column}], after {k} sample(s), "
+                    "more of where the robot is than the environment observes, as from info, the reward, an "
+                    "attribute or MuJoCo's state, where noise does not come: let it observe what the "
+                    "environment observes, or let the environment observe that"
                 )
-        self._veiled.append(real)
 
     def _live(self, run: Played, as_it_is: bool) -> None:
         """Plays a run as a further episode of an environment that is never replaced, as its user has one."""
@@ -276,30 +273,12 @@ class Stage:
         return instance
 
 
-def _parts(run: Played) -> list[Played]:
-    """Returns a run up to its end and up to earlier samples, as others go on from there."""
-    n = len(run.inputs)
-    ends = sorted({n // 4, n // 2, 3 * n // 4} - {0, n})
-    return [run] + [
-        replace(
-            run,
-            inputs=run.inputs[:k],
-            path=run.path[: k + 1],
-            outcome=int(Outcome.RUNNING),
-            cut=False,
-            noise=run.noise[: k + 1],
-        )
-        for k in ends
-    ]
-
-
-def judge(run: Played, real: Instance, noise: np.ndarray, fresh: Instance | None) -> bool:
+def judge(run: Played, real: Instance, noise: np.ndarray, fresh: Instance | None) -> None:
     """Plays a run in an environment that its user would make.
 
     That is put to the start and stepped, past all that lets episodes be played side by side. There is no
-    tolerance: the same code computes the same from the same numbers. Without the run's noise the inputs may
-    lead another way, as where a controller of a wrapper sees it; where they lead the same way, the run ends
-    alike. Where they do not, it ends alike without the noise of its last sample, or of an earlier one, alone.
+    tolerance: the same code computes the same from the same numbers. Without the run's noise, and with the
+    actions that wrappers passed on under it, the run goes and ends alike.
 
     Args:
         run: the run.
@@ -307,9 +286,6 @@ def judge(run: Played, real: Instance, noise: np.ndarray, fresh: Instance | None
         noise: (k + 1, d) that of the run, or none.
         fresh: another one, which has only been reset: what it observes in a state shows what `real` has
             stored on its way there; None where `real` goes on from other episodes.
-
-    Returns:
-        Whether it went the same way, and without wrappers whether it ended alike.
 
     Raises:
         BadInput: the run went otherwise.
@@ -333,9 +309,9 @@ def judge(run: Played, real: Instance, noise: np.ndarray, fresh: Instance | None
     states, observations, reports = zip(*samples, strict=True)
     path = np.vstack([run.path[:1], spec.z(np.array(states[1:]).reshape(-1, len(run.start)))])
     if len(samples) == 1:
-        return True
+        return
     if not heard and not np.array_equal(path, run.path, equal_nan=True):
-        return False
+        raise _notes(spec)
     told = np.array(reports[1:], dtype=float)
     if heard:
         seen = observations[: len(run.observations)]
@@ -343,19 +319,26 @@ def judge(run: Played, real: Instance, noise: np.ndarray, fresh: Instance | None
         _compare(real, "the chart's coordinate", run.path, path)
         _compare(real, "reward", run.rewards, told[:, :1])
     if run.outcome == Outcome.UNSTABLE:
-        return True
+        return
     success, ends = spec.criterion.judged(told)
     if run.cut and ends[-1] == Outcome.RUNNING:
         ends[-1] = spec.criterion.verdict(success[-1:])[0]
     expected = np.append(np.full(len(ends) - 1, int(Outcome.RUNNING)), run.outcome)
     if (wrong := np.flatnonzero(ends != expected)).size:
         if not (heard or spec.wrapped):
-            return False
+            raise _notes(spec)
         k = int(wrong[0])
         ours, theirs = (Outcome(int(values[k])).label for values in (expected, ends))
         how = "" if heard else " without the noise, which must not judge"
         raise _goes_another_way(real, f"after {k + 1} sample(s) it is {ours}, and {theirs}{how}")
-    return True
+
+
+def _notes(spec: EnvironmentSpec) -> BadInput:
+    return BadInput(
+        f"a run of {spec.name} goes or ends otherwise without the noise, with the same actions: step() goes "
+        f"by what {spec.observer}() has noted where noise showed the robot, or a wrapper writes to the "
+        "environment by what it observes, so let them only read"
+    )
 
 
 def _compare(real: Instance, what: str, ours: np.ndarray | None, theirs: Any) -> None:

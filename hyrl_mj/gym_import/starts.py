@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import chain
 from types import FrameType
 from typing import Any
@@ -99,24 +99,34 @@ def _check_ties(spec: EnvironmentSpec, resets: Resets) -> None:
 
 @dataclass(frozen=True)
 class Led:
-    """How the resets of an environment are led to a start; see `_Lead`.
+    """How the resets of an environment are led to a start: what holds their place holds that of the start.
+
+    Homes do so until the reset has ended, MuJoCo's state and variables of functions from before each line of
+    Python on, and attributes when it has ended.
 
     Attributes:
-        homes, holders: see `_homes` and `_holders`.
+        homes: names of numbers by which resets go; see `_homes`.
+        holders: what attributes hold; see `_holders`. None if homes alone are moved.
     """
 
     homes: Sequence[str]
-    holders: Mapping[str, np.ndarray]
+    holders: Mapping[str, np.ndarray] | None
 
     @contextmanager
     def to(self, instance: Instance, state: np.ndarray) -> Iterator[None]:
         """Leads resets of an instance to a state of MuJoCo (S,) within the block, which leave it all else."""
+        spec, known = instance.spec, _numbers_of_resets(instance)
+        by = (state - spec.state)[spec.places[[c.kind == "qpos" for c in spec.coordinates]]]
         instance.own = np.append(own_of(instance), instance.physics.columns["warmstart"])
+        instance.lead = lead = _Lead(instance, state[spec.places], self.holders)
         try:
-            with _Lead(instance, state[instance.spec.places], self.homes, self.holders):
-                yield
+            for name in self.homes:
+                if name in known:  # a reset may hold it otherwise than a constructor
+                    lead.moved.enter_context(_moved(*known[name], by))
+            yield
         finally:
-            instance.own = None
+            instance.own = instance.lead = None
+            lead.end()
 
     def noted(self, usual: Instance, led: Instance, state: np.ndarray) -> list[str]:
         """Puts two instances to a state (S,), one by a reset that is led there.
@@ -148,6 +158,54 @@ class Led:
             "goes by that, so a start elsewhere on the chart is none of its own: let the first "
             "step() note it, pin it, or give starts='reset' if all resets lead to one place"
         )
+
+
+@dataclass
+class _Lead:
+    """Leads one reset of an instance to a place (d,) in MuJoCo's state; see `Led`."""
+
+    instance: Instance
+    place: np.ndarray
+    holders: Mapping[str, np.ndarray] | None
+    moved: ExitStack = field(default_factory=ExitStack)
+    lines: int = 0
+
+    def __call__(self, frame: FrameType, *_: Any) -> Any:
+        """Is told of each line by `sys.settrace`."""
+        if str(frame.f_globals.get("__name__")).partition(".")[0] in LIBRARIES:
+            return None
+        self.lines += 1
+        if self.lines > LINES:
+            raise BadInput(
+                f"reset() of {self.instance.name} takes more than {LINES:,} lines of Python, too many "
+                "to see whether it notes where it leads to: let it compute less, as once where it is made"
+            )
+        if self.holders is None:
+            return self
+        for c, value in zip(self.instance.spec.coordinates, self.place, strict=True):
+            getattr(self.instance.data, c.kind)[c.index] = value
+        variables = frame.f_locals
+        for name, value in [*variables.items()]:
+            if isinstance(value, float | tuple | list | np.ndarray):
+                variables[name] = self._led(value)
+        return self
+
+    def _led(self, value: Any) -> Any:
+        """Returns a value with the start's place where it holds the usual one."""
+        spec = self.instance.spec
+        size = 1 if isinstance(value, float) else getattr(value, "size", 0) or len(value)
+        numbers = numbers_of(value) if size <= FEW else None
+        if numbers is None or ((at := _holding(numbers, spec.state[spec.places])) < 0).all():
+            return value
+        return like(value, np.where(at < 0, numbers, self.place[at]))
+
+    def end(self) -> None:
+        """Ends with a reset, before anything is observed."""
+        self.moved.close()
+        inner, holders = self.instance.inner, self.holders or {}
+        at_end = numbers_in(inner) if holders else {}
+        same = {n: at for n, at in holders.items() if len(at) == len(at_end.get(n, ()))}
+        set_numbers(inner, {n: _numbers_at(self.place, at) for n, at in same.items()})
 
 
 def _check_led(spec: EnvironmentSpec) -> Led | None:
@@ -197,80 +255,6 @@ def _go_apart(spec: EnvironmentSpec, ours: Iterable[Seen], theirs: Iterable[Seen
         if not np.allclose(here, there, rtol=SAME, atol=SAME, equal_nan=True):
             return True
     return False
-
-
-class _Lead:
-    """Leads a reset of an instance, within a block, to a start: what holds its place holds that of the start.
-
-    Homes do so until the reset has ended, MuJoCo's state and variables of functions from before each line of
-    Python on, and attributes when it has ended.
-
-    Args:
-        instance: the environment.
-        place: (d,) of the start in MuJoCo's state.
-        homes: names of numbers by which resets go; see `_homes`.
-        holders: what attributes hold; see `_holders`. None if homes alone are moved.
-    """
-
-    def __init__(
-        self,
-        instance: Instance,
-        place: np.ndarray,
-        homes: Iterable[str],
-        holders: Mapping[str, np.ndarray] | None = None,
-    ):
-        self._instance, self._place, self._holders = instance, place, holders
-        self._usual = instance.spec.state[instance.spec.places]
-        self._homes, self._moved, self._lines = homes, ExitStack(), 0
-
-    def __enter__(self) -> None:
-        known = _numbers_of_resets(self._instance)
-        is_position = [c.kind == "qpos" for c in self._instance.spec.coordinates]
-        by = (self._place - self._usual)[is_position]
-        for name in self._homes:
-            if name in known:  # a reset may hold it otherwise than a constructor
-                self._moved.enter_context(_moved(*known[name], by))
-        self._instance.lead = self
-
-    def __exit__(self, *_: Any) -> None:
-        self._instance.lead = None
-        self.end()
-
-    def __call__(self, frame: FrameType, *_: Any) -> Any:
-        """Is told of each line by `sys.settrace`."""
-        if str(frame.f_globals.get("__name__")).partition(".")[0] in LIBRARIES:
-            return None
-        self._lines += 1
-        if self._lines > LINES:
-            raise BadInput(
-                f"reset() of {self._instance.name} takes more than {LINES:,} lines of Python, too many "
-                "to see whether it notes where it leads to: let it compute less, as once where it is made"
-            )
-        if self._holders is None:
-            return self
-        for c, value in zip(self._instance.spec.coordinates, self._place, strict=True):
-            getattr(self._instance.data, c.kind)[c.index] = value
-        variables = frame.f_locals
-        for name, value in [*variables.items()]:
-            if isinstance(value, float | tuple | list | np.ndarray):
-                variables[name] = self._led(value)
-        return self
-
-    def _led(self, value: Any) -> Any:
-        """Returns a value with the start's place where it holds the usual one."""
-        size = 1 if isinstance(value, float) else getattr(value, "size", 0) or len(value)
-        numbers = numbers_of(value) if size <= FEW else None
-        if numbers is None or ((at := _holding(numbers, self._usual)) < 0).all():
-            return value
-        return like(value, np.where(at < 0, numbers, self._place[at]))
-
-    def end(self) -> None:
-        """Ends with a reset, before anything is observed."""
-        self._moved.close()
-        inner, holders = self._instance.inner, self._holders or {}
-        at_end = numbers_in(inner) if holders else {}
-        same = {n: at for n, at in holders.items() if len(at) == len(at_end.get(n, ()))}
-        set_numbers(inner, {n: _numbers_at(self._place, at) for n, at in same.items()})
 
 
 def _holding(numbers: np.ndarray, place: np.ndarray) -> np.ndarray:
@@ -340,7 +324,7 @@ def _homes(spec: EnvironmentSpec) -> list[str]:
     state = _starts(spec, np.random.default_rng(12))[0]
     places = spec.places[[c.kind == "qpos" for c in spec.coordinates]]
     for name in _numbers_of_resets(probe) if len(places) else ():
-        with suppress(BadInput), _Lead(probe, state[spec.places], [name]):
+        with suppress(BadInput), Led([name], None).to(probe, state):
             probe.reset()
             now = probe.physics.read()[places]
             there, stays = (np.isclose(now, one[places], SAME, SAME) for one in (state, spec.state))
@@ -357,7 +341,7 @@ def _numbers_of_resets(instance: Instance) -> dict[str, tuple[Any, Any, list[int
     """
     at, nq = [c.index for c in instance.spec.coordinates if c.kind == "qpos"], instance.model.nq
     found = dict[str, tuple[Any, Any, list[int]]]()
-    for name, owner, key in (*held(instance.inner, {}), *shared_variables(instance.env)):
+    for name, owner, key in (*held(instance.inner), *shared_variables(instance.env)):
         numbers = numbers_of(value_at(owner, key))
         if numbers is not None and len(at) <= len(numbers) <= nq:
             found[name] = owner, key, at if len(numbers) == nq else [*range(len(at))]
