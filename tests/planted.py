@@ -14,7 +14,7 @@ from PIL import Image
 from hyrl_mj.errors import NoRenderer
 from hyrl_mj.files.artifacts import digest
 from hyrl_mj.files.manifest import FILES, Entry, Manifest
-from hyrl_mj.gym_import import draws, inspection, resets, starts, trials, uses
+from hyrl_mj.gym_import import draws, inspection, resets, starts, trials
 from hyrl_mj.gym_import.task import EnvironmentTask
 from hyrl_mj.judging import episodes, examination, worst_case
 from hyrl_mj.judging.game import Maps
@@ -141,9 +141,9 @@ def few_trials(patch):
     What these trials have to find is found in so few, too, but for what the fixture `all_trials` is for.
     That they refuse nothing which is honest is tested with all of them, in `test_trapped_environments`.
     """
-    few = {"EPISODES": 4, "SAMPLES": 16, "PLACES": 8, "RESETS": 24, "SELDOM": 60}
+    few = {"EPISODES": 4, "SAMPLES": 16, "PLACES": 8, "RESETS": 24}
     few |= {"RUNS": 8, "LENGTH": 40, "FAR": 2}
-    for module in (inspection, trials, uses, draws, starts, resets):
+    for module in (inspection, trials, draws, starts, resets):
         for name in few.keys() & vars(module).keys():
             patch.setattr(module, name, few[name])
     patch.setattr(trials._runs, "__defaults__", (few["EPISODES"],))

@@ -619,12 +619,9 @@ class Observing(Puck):
 
 
 @pytest.mark.long
-def test_of_several_observers_the_one_that_is_called_counts():
-    task = from_gymnasium(Observing, steps=5)
-    noise = np.zeros((6, 1, len(task.noisy)))
-    noise[:, :, 0] = -0.1
-    (arc,) = simulate(task, always(task, 0, 0), [[-1.4, 0.0]], Recorded(noise, 0.1))
-    assert arc.measured[0, 2] == -1.45
+def test_several_observers_have_to_agree():
+    with pytest.raises(BadInput, match=r"get_obs\(\) and observe\(\) of Observing both give what it"):
+        outcomes(Observing, 0.2)
 
 
 class Far(Flat):

@@ -7,8 +7,8 @@ anything rests on it. What could mislead is looked for in one place each:
 
 - `draws`: what resets draw, which has to be pinned;
 - `trials`: whether what is observed follows the state, and whether episodes go as those of a new environment,
-  by the judges of `stage`, which also judge the runs of agents later;
-- `uses`: ways on which the place is told past the noise;
+  by the judges of `stage`, which also judge the runs of agents later, and look for ways on which wrappers
+  are told the place past the noise;
 - `starts`: whether a start elsewhere on the chart is as one that a reset would lead to.
 
 They share what 64 `resets` lead to, numbers in `attributes`, and the `fingerprint` of all that is remembered.

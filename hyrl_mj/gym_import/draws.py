@@ -14,7 +14,7 @@ from hyrl_mj.gym_import.instance import Instance
 from hyrl_mj.gym_import.resets import Resets
 from hyrl_mj.gym_import.trials import EPISODES, HELD, SAMPLES
 
-# Resets whose runs are compared, beside those that bring rare values.
+# Resets whose runs are compared, beside those that change something.
 COMPARED = 4
 # Of what resets draw of the robot: how much of what runs reach is wide, and by how much of it the ends of
 # runs may differ.
@@ -92,13 +92,14 @@ def _drawn(instance: Instance, resets: Resets) -> list[str]:
             "inputs: it depends on the clock, on threads, or on chance that no seed decides, so let it "
             "compute with the time of MuJoCo, and draw from self.np_random in its reset"
         )
+    telling = [seed for seed, names in enumerate(resets.changes) if names - lasting]
     begun = [
         _begun(
             Instance(instance.spec) if lasting else instance,
             states[: 3 if seed < COMPARED else 1],
             seed,
         )
-        for seed in resets.telling(COMPARED, lasting)
+        for seed in dict.fromkeys((*range(COMPARED), *telling))
     ]
     if lasting:  # nothing has outlasted the first reset of a new instance
         lasting = set(differing(begun[0][0], _begun(Instance(instance.spec), states[:1], 0)[0]))

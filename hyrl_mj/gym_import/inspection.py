@@ -41,7 +41,6 @@ from hyrl_mj.gym_import.pool import Pool
 from hyrl_mj.gym_import.resets import SAME, resets_of, violation_of
 from hyrl_mj.gym_import.specification import Criterion
 from hyrl_mj.gym_import.starts import VIOLATED, check_noted
-from hyrl_mj.gym_import.uses import check_copied, check_use
 from hyrl_mj.physics import memory, mjcf
 from hyrl_mj.sets import Chart
 
@@ -85,7 +84,7 @@ def inspect(description: Description, untried: bool = False) -> tuple[Pool, Inst
     _check_pinned(instance)
     instance.reset()
     _learn_spaces(instance)
-    instance.learn(observer=trials.observer_of(instance))
+    instance.learn(observers=trials.observers_of(instance))
     _learn_coordinates(instance)
     states, info = _sampled(instance)
     instance.learn(criterion=_criterion(instance, info))
@@ -98,8 +97,8 @@ def inspect(description: Description, untried: bool = False) -> tuple[Pool, Inst
     instance.learn(recalled=trials.check_observer(instance.spec))
     pool.learn(instance.spec)
     trials.check_episodes(pool)
-    check_use(instance.spec)
-    check_copied(instance.spec)
+    trials.check_use(instance.spec)
+    trials.check_copied(instance.spec)
     derived, late = trials.derived_of(instance)
     if late:
         instance.spec.found["lag"] = f"observation {', '.join(map(str, late))} {LAG[derived]}"

@@ -433,12 +433,20 @@ class Instance:
 
     def watched(self) -> Any:
         """Returns what the innermost environment observes in its present state."""
-        try:
-            return self._observers[self.spec.observer]()
-        except Exception as error:
-            raise BadInput(
-                f"{self.spec.observer}() of {self.name} raises {brief(error)}: repair it"
-            ) from error
+        space, names, seen = self.inner.observation_space, self.spec.observers, list[Any]()
+        for name in names:
+            try:
+                seen.append(self._observers[name]())
+            except Exception as error:
+                raise BadInput(
+                    f"{name}() of {self.name} raises {brief(error)}: repair it"
+                ) from error
+            if not np.array_equal(flat(seen[0], space), flat(seen[-1], space), equal_nan=True):
+                raise BadInput(
+                    f"{names[0]}() and {name}() of {self.name} both give what it observes, but differ where "
+                    "noise may show the robot: let one of them have another name"
+                )
+        return seen[0]
 
     def displaced(self, noise: np.ndarray) -> Any:
         """Returns what the innermost environment observes with noise (d,) on the chart's coordinates.
@@ -458,7 +466,7 @@ class Instance:
             column = int(((again != given) & ~(np.isnan(again) & np.isnan(given))).argmax())
             raise BadInput(
                 f"{self.name} has observed {given[column]:.6g} in observation[{column}], and "
-                f"{self.spec.observer}() gives {again[column]:.6g} in the same state: let it compute all "
+                f"{self.spec.observers[0]}() gives {again[column]:.6g} in the same state: let it compute all "
                 "that is observed, and remember nothing"
             )
         return shaped(seen, self.inner_seen, space)

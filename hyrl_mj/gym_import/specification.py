@@ -169,7 +169,7 @@ class EnvironmentSpec:
         inputs: their names.
         levels: number of a discrete action's values; None of continuous ones.
         wrapped: whether wrappers lie around the environment.
-        observer: the name of what computes the observation, of those that `observers` gives.
+        observers: the names of what computes the observation, of those that `observers` gives.
         coordinates: of the decision.
         noisy: (d,) share of the noise bound on each coordinate.
         solid: (ngeom,) bool, the geoms of the robot.
@@ -206,7 +206,7 @@ class EnvironmentSpec:
     inputs: tuple[str, ...] = ()
     levels: int | None = None
     wrapped: bool = False
-    observer: str = ""
+    observers: tuple[str, ...] = ()
     coordinates: tuple[Coordinate, ...] = ()
     noisy: tuple[float, ...] = ()
     solid: np.ndarray = field(default_factory=_none)

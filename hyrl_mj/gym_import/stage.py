@@ -336,7 +336,7 @@ def judge(run: Played, real: Instance, noise: np.ndarray, fresh: Instance | None
 def _notes(spec: EnvironmentSpec) -> BadInput:
     return BadInput(
         f"a run of {spec.name} goes or ends otherwise without the noise, with the same actions: step() goes "
-        f"by what {spec.observer}() has noted where noise showed the robot, or a wrapper writes to the "
+        f"by what {spec.observers[0]}() has noted where noise showed the robot, or a wrapper writes to the "
         "environment by what it observes, so let them only read"
     )
 

@@ -1,22 +1,23 @@
-"""Trials of an environment: whether what it observes follows its state, and its instances go as new ones."""
+"""Trials of an environment: whether what it observes follows its state, as far as it uses that itself, and
+whether its instances go as new ones.
+"""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterable, Iterator
-from inspect import unwrap
 from itertools import chain
-from types import FrameType, FunctionType
 from typing import Any
 
 import numpy as np
 
 from hyrl_mj.errors import BadInput
+from hyrl_mj.gym_import.coordinates import own_of
 from hyrl_mj.gym_import.fingerprint import differing
-from hyrl_mj.gym_import.instance import Instance, renewed
-from hyrl_mj.gym_import.observations import flat, observers
+from hyrl_mj.gym_import.instance import Instance, Seen, renewed, to_end
+from hyrl_mj.gym_import.observations import flat, observers, shaped
 from hyrl_mj.gym_import.plant import EnvironmentPlant, check_finite
 from hyrl_mj.gym_import.pool import Pool
+from hyrl_mj.gym_import.resets import SAME
 from hyrl_mj.gym_import.specification import MOVED, Derived, EnvironmentSpec
 from hyrl_mj.gym_import.stage import Played
 from hyrl_mj.system.generators import kept_generators
@@ -29,8 +30,8 @@ EPISODES, SAMPLES, HELD = 8, 40, 8
 PLACES, AWAY, FAR = 64, 2, 5
 
 
-def observer_of(instance: Instance) -> str:
-    """Returns the name of what computes what an environment observes; raises `BadInput` if nothing does."""
+def observers_of(instance: Instance) -> tuple[str, ...]:
+    """Returns the names of what computes what an environment observes; raises `BadInput` if nothing does."""
     rng, space = np.random.default_rng(0), instance.inner.observation_space
     left = observers(instance.env)
     for seed in range(EPISODES):
@@ -49,28 +50,7 @@ def observer_of(instance: Instance) -> str:
             "whose answer step() and reset() return as it is; let reset() call mj_forward before it "
             "observes, and let no wrapper move the robot in its reset()"
         )
-    return _called(instance, left) or next(iter(left))
-
-
-def _called(instance: Instance, names: Iterable[str]) -> str:
-    """Returns which of some methods of the environment a step calls last, outside of others; "" if none."""
-    within, last, before = 0, "", sys.getprofile()
-    methods = {name: getattr(type(instance.inner), name, None) for name in names}
-    codes = {unwrap(m).__code__: n for n, m in methods.items() if isinstance(m, FunctionType)}
-
-    def watch(frame: FrameType, event: str, _: Any) -> None:
-        nonlocal within, last
-        if event in ("call", "return") and frame.f_code in codes:
-            last = last if within else codes[frame.f_code]
-            within += 1 if event == "call" else -1
-
-    instance.reset()
-    sys.setprofile(watch)
-    try:
-        instance.stepped(instance.drawn(np.random.default_rng(0)))
-    finally:
-        sys.setprofile(before)
-    return last
+    return tuple(left)
 
 
 def _agrees(get: Any, seen: np.ndarray, space: Any) -> bool:
@@ -206,6 +186,106 @@ def moving(pool: Pool) -> tuple[np.ndarray, np.ndarray | None]:
     fit = np.linalg.lstsq(terms := spec.terms(z), seen, rcond=None)[0]
     exact = _rounds(np.abs(terms @ fit - seen), seen).all()
     return np.ptp(seen, axis=0) > 0, fit if exact else None
+
+
+def check_use(spec: EnvironmentSpec) -> None:
+    """Raises `BadInput` if step() changes what is observed under noise, or moves the robot by it.
+
+    The same runs are played by an environment whose observer sees the true place, and by one whose observer
+    sees others, all over the chart. What the latter gives has to be returned, and both runs have to go the
+    same way. Wrappers give the actions of the former.
+    """
+    true, noisy = Instance(spec), Instance(spec)
+    inner, offset, given = noisy.inner, np.zeros(spec.dimension), list[np.ndarray]()
+    own = getattr(inner, "__dict__", dict.fromkeys(spec.observers))
+    names = [name for name in spec.observers if hasattr(type(inner), name) and name not in own]
+    if (
+        not names
+    ):  # it is made of several methods, or put in already, or the environment allows no attributes
+        return
+
+    def observe() -> Any:
+        given.append(noisy.seen_as("now", noisy.physics.read(), offset))
+        return shaped(given[-1], noisy.inner_seen, inner.observation_space)
+
+    rng, half = np.random.default_rng(10), spec.chart.sides * (np.array(spec.noisy) > 0) / 2
+    for state in spec.state_at(spec.anywhere(rng, EPISODES)):
+        for name in names:
+            vars(inner).pop(name, None)
+        for one in (true, noisy):  # both, so that they are reset as often
+            one.reset()
+            one.arrive(state)
+        vars(inner).update(dict.fromkeys(names, observe))
+        if true.physics.depth(spec.solid) > spec.depth:
+            continue
+        for k in range(min(SAMPLES, spec.max_steps)):
+            if k % HELD == 0:
+                u = true.drawn(rng)
+            true.passed.clear()
+            ended = any(true.stepped(u)[2:4])
+            if spec.wrapped and len(true.passed) != 1:  # wrappers step several times, or not at all
+                return
+            noisy.script, offset[:] = iter(true.passed[:]), rng.uniform(-half, half)
+            given.clear()
+            try:
+                ended |= any(noisy.stepped(u)[2:4])
+            except BadInput:  # step() may not be able to work with such observations
+                break
+            before, after = true.physics.read(), noisy.physics.read()
+            if not np.array_equal(before, after, equal_nan=True):
+                raise BadInput(
+                    f"step() of {spec.name} moves the robot by what {names[0]}() gives, where noise "
+                    "does not come: let it read MuJoCo's state, or put the controller into a wrapper, which "
+                    "sees the noise"
+                )
+            seen = flat(noisy.inner_seen, inner.observation_space)
+            if given and not any(np.array_equal(one, seen, equal_nan=True) for one in given):
+                raise BadInput(
+                    f"step() of {spec.name} changes what {names[0]}() gives where noise may show the "
+                    "robot, as where it clips: let that method compute all that is observed"
+                )
+            if ended:
+                break
+
+
+def check_copied(spec: EnvironmentSpec) -> None:
+    """Raises `BadInput` if what is observed shows the place by what code copies into MuJoCo's state.
+
+    A copy, as of a camera that is put above the robot, is moved by as much as the robot, whatever it was
+    before. What follows the place in `userdata`, where no physics writes, is one, too, also
+    scaled or filtered. Noise on the chart does not reach it.
+    """
+    rng, one, step = np.random.default_rng(15), Instance(spec), spec.nudge
+    columns, far = one.physics.columns, float(step.max())
+    parts = ("qpos", "qvel", "ctrl", "mocap_pos", "mocap_quat", "userdata")  # but for forces
+    others = np.setdiff1d(np.concatenate([columns[part] for part in parts]), own_of(one))
+    for i, z in enumerate(spec.anywhere(rng, EPISODES if len(others) else 0)):
+        inputs = [one.drawn(rng)] * (HELD if i % 2 else 1)
+        none = np.zeros((len(inputs) + 1, spec.dimension))
+        usual, elsewhere = spec.state_at(np.array([z, z + step]))
+        before = usual.copy()
+        before[others] += far
+        runs = list[list[Seen]]()
+        for start in (usual, elsewhere, before):
+            one = renewed(one)
+            runs.append([*to_end(one.play(start, inputs, none))])
+        if len({len(run) for run in runs}) > 1:
+            continue
+        here, there, after = (run[-1].state for run in runs)
+        by = np.append(step, (there - here)[spec.places])
+        moved = np.abs((there - here)[others, None] - by[by != 0]) <= SAME * far
+        is_copy = moved.any(axis=1) & (np.abs(after - here)[others] <= SAME * far)
+        noted = np.isin(others, columns["userdata"]) & (there != here)[others]
+        copies = others[is_copy | noted]
+        other = here.copy()
+        other[copies] = there[copies]
+        seen, shown = (one.seen_as("now", state, none[0]) for state in (here, other))
+        if not np.array_equal(seen, shown, equal_nan=True):
+            names = ", ".join(one.physics.names[at] for at in copies[:4])
+            raise BadInput(
+                f"what {spec.name} observes shows {names}, to which code copies the place of the robot, "
+                "where noise does not reach it: let it observe the place itself"
+            )
 
 
 # ---- runs of several instances
