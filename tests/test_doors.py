@@ -232,11 +232,10 @@ def test_a_step_that_takes_long_is_one_sentence(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("what", ["kwargs", "pinned"])
-def test_an_environment_that_never_ends_a_step_is_one_sentence(what):
-    given = {"pinned": {"qpos[2]": 0.1, "qpos[3]": 0.1}, "kwargs": {}, "success": "reward >= 1"}
-    given[what] = given[what] | {"frame_skip": 2_000_000_000}
-    assert "takes longer than" in refusal(lambda: from_gymnasium("Reacher-v5", **given))
+def test_an_environment_that_never_ends_a_step_is_one_sentence():
+    given = {"pinned": {"qpos[2]": 0.1, "qpos[3]": 0.1}, "kwargs": {"frame_skip": 2_000_000_000}}
+    sentence = refusal(lambda: from_gymnasium("Reacher-v5", success="reward >= 1", **given))
+    assert "takes longer than" in sentence
 
 
 def test_a_model_writes_no_warnings_into_the_current_folder(tmp_path, monkeypatch):

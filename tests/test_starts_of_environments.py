@@ -640,7 +640,6 @@ class Viewed(Puck):
         (Shaped, {}),
         (ServoToAGoal, {"seed": 3}),
         (Posture, {}),
-        (Ahead, {"pinned": {"goal": np.array([1.0, 2.0])}}),
         (Shaped, {"seed": 0}),
         (Servo, {}),
         (Muscles, {}),

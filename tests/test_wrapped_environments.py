@@ -620,7 +620,9 @@ class Observing(Puck):
 
 @pytest.mark.long
 def test_several_observers_have_to_agree():
-    with pytest.raises(BadInput, match=r"get_obs\(\) and observe\(\) of Observing both give what it"):
+    with pytest.raises(
+        BadInput, match=r"get_obs\(\) and observe\(\) of Observing both give what it"
+    ):
         outcomes(Observing, 0.2)
 
 

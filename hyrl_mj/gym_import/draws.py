@@ -11,11 +11,17 @@ from hyrl_mj.errors import BadInput
 from hyrl_mj.gym_import.coordinates import own_of
 from hyrl_mj.gym_import.fingerprint import Fingerprint, differing
 from hyrl_mj.gym_import.instance import Instance
+from hyrl_mj.gym_import.physics import PINNED
 from hyrl_mj.gym_import.resets import Resets
 from hyrl_mj.gym_import.trials import EPISODES, HELD, SAMPLES
 
 # Resets whose runs are compared, beside those that change something.
 COMPARED = 4
+# What is drawn where nothing tells it.
+UNKNOWN = (
+    "something that no attribute holds (or it depends on the clock, on threads, or on chance that no seed "
+    "decides: let it compute with the time of MuJoCo, and draw from self.np_random in its reset)"
+)
 # Of what resets draw of the robot: how much of what runs reach is wide, and by how much of it the ends of
 # runs may differ.
 WIDE, APART = 1 / 3, 0.15
@@ -47,9 +53,7 @@ def check_draws(instance: Instance, resets: Resets, met: np.ndarray) -> str:
     left = [n for n in names if n not in changed and n.partition("[")[0] not in changed]
     if left and seed is None:
         how = 'with options of reset as {"reset": {"goal_cell": [6, 6]}}'
-        if positions := {
-            n: 0.1 for n in left if n.startswith(("qpos[", "qvel[", "mocap_pos[", "userdata["))
-        }:
+        if positions := {n: 0.1 for n in left if n.partition("[")[0] in PINNED}:
             how = f"with values as {json.dumps({'pinned': dict(list(positions.items())[:4])})}"
         raise BadInput(
             f"each reset of {name} draws {', '.join(left[:8])}, and what is to be done depends on it: "
@@ -61,7 +65,6 @@ def check_draws(instance: Instance, resets: Resets, met: np.ndarray) -> str:
             f"each reset of {name} draws {', '.join(left[:8]) or kept} from a global generator of NumPy or "
             "Python, which the seed of reset() does not decide: let it draw from self.np_random"
         )
-    _check_pins(instance)
     if not names:
         return ""
     by_options = f" and {dict(options)}" if options else ""
@@ -84,13 +87,6 @@ def _drawn(instance: Instance, resets: Resets) -> list[str]:
         raise BadInput(
             f"{instance.name} draws random numbers in reset(), from a generator that its seed does not "
             f"decide ({min(own)}): let it draw from self.np_random"
-        )
-    one, other = (_begun(Instance(instance.spec), states[:1], 0)[1] for _ in range(2))
-    if not np.array_equal(one, other, equal_nan=True):
-        raise BadInput(
-            f"two new environments {instance.name} go apart after a reset with the same seed, under the same "
-            "inputs: it depends on the clock, on threads, or on chance that no seed decides, so let it "
-            "compute with the time of MuJoCo, and draw from self.np_random in its reset"
         )
     telling = [seed for seed, names in enumerate(resets.changes) if names - lasting]
     begun = [
@@ -125,7 +121,7 @@ def _drawn(instance: Instance, resets: Resets) -> list[str]:
             )
         return names + of_model
     goals = [name for name in differ if any(word in name for word in ("goal", "target", "task"))]
-    return names + of_model + (goals or differ) or ["something that no attribute holds"]
+    return names + of_model + (goals or differ) or [UNKNOWN]
 
 
 def _keep(instance: Instance, what: str) -> None:
@@ -204,22 +200,3 @@ def _changed_by_user(instance: Instance) -> set[str]:
             remembered.update(zip(instance.physics.names, state, strict=True))
         found.update(differing(*seen))
     return found
-
-
-def _check_pins(instance: Instance) -> None:
-    """Raises `BadInput` if a value pins an attribute, of which what a seed pins may be a copy.
-
-    Such a copy, as the place of a site, would stay where the seed puts it.
-    """
-    description, seen = instance.spec.description, list[Fingerprint]()
-    for seed in range(COMPARED if description.seed is not None else 0):
-        instance.reset(seed, plain=True)
-        seen.append(instance.memory())
-    instance.reset()
-    drawn = {name.partition("[")[0] for one in seen for name in differing(one, seen[0])}
-    if both := [name for name in description.pinned if name in drawn]:
-        raise BadInput(
-            f"{both[0]} of {instance.name}, which resets draw, is pinned by a value, and what else they draw "
-            "by a seed, where copies of it may stay, as in the model: pin it by options of reset, or by "
-            "another seed"
-        )

@@ -97,10 +97,8 @@ class Instance:
         physics = physics_of(env)
         assert physics is not None
         self.spec, self.name, self.steps = spec, spec.name, steps_of(env)
-        as_it_is, names = (
-            real and spec.description.steps is None,
-            [type(one).__name__ for one in layers(env)],
-        )
+        as_it_is = real and spec.description.steps is None
+        names = [type(one).__name__ for one in layers(env)]
         self.env, (self.model, self.data) = env if as_it_is else peeled(env), physics
         self.physics = Physics(self.model, self.data)
         self.inner: Any = self.env.unwrapped
@@ -201,11 +199,7 @@ class Instance:
         return self.observation
 
     def play(
-        self,
-        start: np.ndarray,
-        inputs: Iterable[np.ndarray],
-        noises: np.ndarray,
-        seed: int | None = None,
+        self, start: np.ndarray, inputs: Iterable[np.ndarray], noises: np.ndarray
     ) -> Iterator[Seen]:
         """Yields what is seen of a run at its start, after a reset (see `renew`), and after each sample.
 
@@ -213,9 +207,8 @@ class Instance:
             start: MuJoCo's state (S,).
             inputs: (k, m) of the samples.
             noises: (k + 1, d) on the coordinates of the chart.
-            seed: of the reset of wrappers, by default the one that all runs begin from.
         """
-        self.begin(start, seed)
+        self.begin(start)
         self.sense(noises[0])
         yield Seen(start, self.observation, ())
         yield from self.goes_on(inputs, noises[1:])
@@ -242,7 +235,7 @@ class Instance:
     def pin(self) -> None:
         """Sets what is pinned."""
         if pinned := self.spec.description.pinned:
-            set_pins(self.inner, self.data, pinned, self.name)
+            set_pins(self.data, pinned, self.name)
             self.physics.write(self.physics.read())
 
     def memory(self) -> written.Fingerprint:

@@ -88,8 +88,8 @@ class Description:
             if not _all(ends, Real) or len(ends) != 2 or not 0 < ends[1] - ends[0] <= 1e6:
                 raise refused(f"bounds of {name}", ends, "its low and its high end, as [-2, 2]")
         for name, value in self.pinned.items():
-            if not _is_numeric(value):
-                raise refused(f"pinned {name}", value, "a number, or a list of numbers")
+            if not isinstance(value, Real) or not np.isfinite(float(value)):
+                raise refused(f"pinned {name}", value, "a finite number")
         Optional(Integer(1, 1_000_000)).checked("steps", self.steps)
         check_seed(0 if self.seed is None else self.seed)
         OneOf(("chart", "reset")).checked("starts", self.starts)
@@ -106,14 +106,6 @@ def _all(values: Any, kind: type) -> bool:
     """Returns whether a value is a list, or another collection, of one kind."""
     several = isinstance(values, Collection) and not isinstance(values, str | Mapping)
     return several and all(isinstance(value, kind) for value in values)
-
-
-def _is_numeric(value: Any) -> bool:
-    """Returns whether a value is a finite number, or an array of them."""
-    with suppress(ValueError):  # lists of different lengths, or of texts
-        array = _array(value)
-        return array.dtype.kind in "biuf" and bool(np.isfinite(array).all())
-    return False
 
 
 def with_arrays(content: dict[str, Any]) -> Any:

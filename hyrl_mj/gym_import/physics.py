@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cache, cached_property
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -17,6 +16,8 @@ MOVES = (
     "qpos", "body_", "jnt_", "dof_", "geom_", "site_", "tendon_", "wrap_", "actuator_", "sensor_", "eq_",
     "pair_", "exclude_", "numeric_data", "hfield_data", "flex_", "cam_", "key_",
 )  # fmt: skip
+# What can be pinned.
+PINNED = ("qpos", "qvel", "mocap_pos", "userdata")
 
 
 class Physics:
@@ -113,35 +114,26 @@ def _moving_parts() -> list[str]:
     return [n for n in dir(mujoco.MjModel) if n.startswith(MOVES) and not n.endswith(looks)]
 
 
-def set_pins(env: Any, data: mujoco.MjData, pinned: Mapping[str, Any], name: str) -> None:
-    """Sets positions, velocities and attributes of an environment to pinned values, by name.
+def set_pins(data: mujoco.MjData, pinned: Mapping[str, float], name: str) -> None:
+    """Sets numbers in MuJoCo's data, as "qpos[0]", to pinned values, by name.
 
     Args:
-        env: the environment, without wrappers.
         data: of MuJoCo.
         pinned: the values.
         name: of the environment, for messages.
 
     Raises:
-        BadInput: it has no such place, or one of another shape.
+        BadInput: there is no such place.
     """
     for place, value in pinned.items():
         kind, _, rest = place.partition("[")
-        if kind in ("qpos", "qvel", "mocap_pos", "userdata") and rest.endswith("]"):
-            values, i = getattr(data, kind).reshape(-1), rest[:-1]
-            if not i.isdigit() or int(i) >= len(values):
-                held = f"{kind}[0] to [{len(values) - 1}]" if len(values) else f"no {kind}"
-                raise BadInput(f"{name} has no {place}: there are {held}")
-            if np.ndim(value):
-                raise BadInput(f"pinned {place} is {value}: give one number")
-            values[int(i)] = value
-            continue
-        old: Any = getattr(env, place, None)
-        numbers = isinstance(old, bool | int | float | list | tuple | np.ndarray | np.generic)
-        if not numbers or np.shape(old) != np.shape(value):
+        if kind not in PINNED or not rest.endswith("]"):
             raise BadInput(
-                f"{name} has no attribute {place} of shape {np.shape(value)} to pin: name a position as "
-                "qpos[2], or an attribute"
+                f"pinned {place} of {name} is no number of MuJoCo's data: pin {', '.join(PINNED)}, as "
+                "qpos[2], and what attributes hold by options of reset, by a seed, or in its own reset()"
             )
-        like: Any = np.array if isinstance(old, np.ndarray) else type(old)
-        setattr(env, place, like(value) if np.ndim(value) else value)
+        values, i = getattr(data, kind).reshape(-1), rest[:-1]
+        if not i.isdigit() or int(i) >= len(values):
+            held = f"{kind}[0] to [{len(values) - 1}]" if len(values) else f"no {kind}"
+            raise BadInput(f"{name} has no {place}: there are {held}")
+        values[int(i)] = value

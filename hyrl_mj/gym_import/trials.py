@@ -12,7 +12,6 @@ import numpy as np
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.gym_import.coordinates import own_of
-from hyrl_mj.gym_import.fingerprint import differing
 from hyrl_mj.gym_import.instance import Instance, Seen, renewed, to_end
 from hyrl_mj.gym_import.observations import flat, observers, shaped
 from hyrl_mj.gym_import.plant import EnvironmentPlant, check_finite
@@ -95,14 +94,6 @@ def check_observer(spec: EnvironmentSpec) -> np.ndarray:
         for k, result in enumerate(instance.wander(np.random.default_rng(8), away, HELD), 1):
             if any(result[2:4]) or (k != AWAY and k % HELD):
                 continue
-            if k == SAMPLES:
-                before = instance.memory()
-                instance.displaced(spec.nudge)
-                if changed := differing(instance.memory(), before):
-                    raise BadInput(
-                        f"{name} changes {changed[0]} when it computes what it observes, so that cannot be "
-                        "asked for where noise shows the robot: let it only read"
-                    )
             seen = instance.seen_as("now", spec.state, none)
             recalled = recalled | instance.recalls(fresh, spec.state, none)
             off = _apart(seen, usual.setdefault(k, seen))
