@@ -48,7 +48,7 @@ VALUES = {
         ('info["success"] == 1 or info["success"] < 1', [1, 1, 0, 1]),
         ('info["a"]["b"][-1] >= 1', [0, 0, 1, 1]),
         ("distance(fingertip, target) <= 0.1", [0, 0, 1, 1]),
-        ("distance('arm/finger tip', goal-tip.x) <= 0.1", [1, 1, 0, 0]),
+        ("distance('arm/finger tip', 'goal-tip.x') <= 0.1", [1, 1, 0, 0]),
         ("(terminated\n or truncated)", [0, 1, 1, 1]),
     ],
 )

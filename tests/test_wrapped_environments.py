@@ -159,7 +159,7 @@ def by(what, look):
     return lambda: By(telling(what), look)
 
 
-TOLD = r"a wrapper of .* shows in observation\[[01]\], after \d+ sample\(s\), more of where the robot is"
+TOLD = r"a wrapper of .* shows in observation\[[01]\], after \d+ sample\(s\), more of the robot"
 WAYS = {
     "info": by("x", lambda env, *rest: rest[-1].get("x", -1.4)),
     "the last info": lambda: ByLastInfo(telling("x")),

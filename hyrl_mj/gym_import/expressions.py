@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ast
 import math
-import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -25,7 +24,6 @@ FORMS = 'terminated, truncated, reward, info["key"] and distance(a, b), with and
 # Conditions are read by people: [characters], and levels of brackets and operators, where Python's stack is
 # far from its end.
 LENGTH, DEPTH = 1000, 50
-PLACE = re.compile(r"[\w.-]+")  # a name in a model that need not be quoted
 # The names that need no others, and whether they are true or false.
 NAMES = {"terminated": True, "truncated": True, "reward": False}
 OPERATORS: dict[type, Callable[..., Any]] = {
@@ -244,16 +242,13 @@ class Expression:
         return tuple(steps)
 
     def _place(self, node: ast.expr) -> str:
-        """Returns a name in the model: quoted, or bare if it looks like names, dots and hyphens."""
-        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value:
-            return node.value
-        # The source itself: `finger-tip` is a difference, and `body.1` would be no tree at all.
-        source = ast.get_source_segment(self.text.strip(), node) or ""
-        if not PLACE.fullmatch(source):
-            self._refuse(
-                f"{_short(source)!r} is no name of the model: quote names with other characters than . and -"
-            )
-        return source
+        """Returns a name in the model: quoted, or bare if it is a name of Python."""
+        match node:
+            case ast.Name(id=name) | ast.Constant(value=str() as name) if name:
+                return name
+        self._refuse(
+            f"{self._text_of(node)!r} is no name of the model: quote names that are none of Python"
+        )
 
     def _text_of(self, node: ast.expr) -> str:
         return _short(ast.get_source_segment(self.text.strip(), node) or "")

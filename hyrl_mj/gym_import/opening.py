@@ -245,14 +245,9 @@ def _checked(env: Any, name: str) -> mujoco.MjModel:
         raise BadInput(
             f"{name} is a {type(env).__name__}: give a single gymnasium.Env, or a function that makes one"
         )
-    try:
+    physics = None
+    with suppress(Exception):  # whatever it raises before its first reset
         physics = physics_of(env)
-    except Exception:  # whatever it raises before its first reset
-        try:
-            env.reset(seed=0)
-            physics = physics_of(env)
-        except Exception as error:
-            raise BadInput(f"{name} cannot be reset ({brief(error)}): repair it") from error
     if physics is None:
         raise BadInput(
             f"{name} is not simulated by MuJoCo, as far as its attributes model and data tell: give an "

@@ -190,7 +190,7 @@ class Stage:
         return real.passed
 
     def _check_told(self, run: Played, passed: Sequence[Passed], seed: int) -> None:
-        """Raises `BadInput` if wrappers observe more of where the robot is than the environment observes.
+        """Raises `BadInput` if wrappers observe more of the robot than the environment observes.
 
         They get what they got in a run, but in an environment whose robot is elsewhere.
         """
@@ -207,9 +207,9 @@ class Stage:
                 column = int(((seen != shown) & ~(np.isnan(seen) & np.isnan(shown))).argmax())
                 raise BadInput(
                     f"a wrapper of {self.spec.name} shows in observation[{column}], after {k} sample(s), "
-                    "more of where the robot is than the environment observes, as from info, the reward, an "
-                    "attribute or MuJoCo's state, where noise does not come: let it observe what the "
-                    "environment observes, or let the environment observe that"
+                    "more of the robot than the environment observes, as from info, the reward, an attribute "
+                    "or MuJoCo's state, where noise does not come: let it observe what the environment "
+                    "observes, or let the environment observe that"
                 )
 
     def _live(self, run: Played, as_it_is: bool) -> None:
