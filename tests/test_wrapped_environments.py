@@ -145,6 +145,19 @@ class Before(gym.Wrapper):
         return np.append(before, observation[2:]), *rest
 
 
+class Odometer(gym.Wrapper):
+    """Shows how far it has come from its start."""
+
+    def reset(self, **options):
+        found = self.env.reset(**options)
+        self.begun = self.unwrapped.data.qpos.copy()
+        return found
+
+    def step(self, action):
+        observation, *rest = self.env.step(action)
+        return np.append(self.unwrapped.data.qpos - self.begun, observation[2:]), *rest
+
+
 class Copying(gym.Wrapper):
     def step(self, action):
         copy.deepcopy(self.env)
@@ -179,6 +192,7 @@ WAYS = {
     "a cell": by("", lambda env, *_: np.round(env.unwrapped.data.qpos)),
     "derived quantities": lambda: Placed(Flat()),
     "the place before": lambda: Before(Flat()),
+    "the way": lambda: Odometer(Flat()),
 }
 
 

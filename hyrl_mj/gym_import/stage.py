@@ -6,6 +6,7 @@ stepped, has to go and to end alike.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -192,10 +193,13 @@ class Stage:
     def _check_told(self, run: Played, passed: Sequence[Passed], seed: int) -> None:
         """Raises `BadInput` if wrappers observe more of the robot than the environment observes.
 
-        They get what they got in a run, but in an environment whose robot is elsewhere.
+        They get what they got in a run, but in an environment whose robot is elsewhere, and goes elsewhere.
         """
         other, chart = self._renewed(self._elsewhere), self.spec.chart
-        other.script, other.is_told, told = iter(passed), True, list[np.ndarray]()
+        actions = copy.deepcopy(other.inner.action_space)
+        actions.seed(seed)
+        other.script = iter([one._replace(action=actions.sample()) for one in passed])
+        other.is_told, told = True, list[np.ndarray]()
         place = np.random.default_rng(seed).uniform(chart.low, chart.high)
         (start,) = self.spec.state_at(place[None])
         with suppress(BadInput):  # it may not be able to go on from there
