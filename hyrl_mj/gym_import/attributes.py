@@ -79,10 +79,10 @@ def taken_apart(value: Any) -> tuple[np.ndarray, list[str]] | None:
     found = list[Any]()
     try:
         _take(value, found)
-    except TypeError:
+        numbers = np.array([part for part in found if not isinstance(part, str)], dtype=float)
+    except Exception:  # it is more, or whatever a foreign class raises
         return None
-    texts = [part for part in found if isinstance(part, str)]
-    return np.array([part for part in found if not isinstance(part, str)], dtype=float), texts
+    return numbers, [part for part in found if isinstance(part, str)]
 
 
 def _take(value: Any, found: list[Any]) -> None:
