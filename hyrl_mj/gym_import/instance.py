@@ -23,7 +23,7 @@ from gymnasium import spaces
 from hyrl_mj.errors import BadInput, HyrlError, brief
 from hyrl_mj.gym_import import fingerprint as written
 from hyrl_mj.gym_import.expressions import entry
-from hyrl_mj.gym_import.observations import flat, observers, shaped
+from hyrl_mj.gym_import.observations import flat, observers, shaped, unlike
 from hyrl_mj.gym_import.opening import (
     actions_of,
     checked_step,
@@ -434,7 +434,7 @@ class Instance:
                 raise BadInput(
                     f"{name}() of {self.name} raises {brief(error)}: repair it"
                 ) from error
-            if not np.array_equal(flat(seen[0], space), flat(seen[-1], space), equal_nan=True):
+            if len(seen) > 1 and unlike(flat(seen[0], space), flat(seen[-1], space)).any():
                 raise BadInput(
                     f"{names[0]}() and {name}() of {self.name} both give what it observes, but differ where "
                     "noise may show the robot: let one of them have another name"
@@ -455,8 +455,8 @@ class Instance:
         if derived == "unknown":
             seen = given + (seen - self.seen_as("now", state, np.zeros(len(noise))))
         again = flat(self.watched(), space)
-        if again.tobytes() != given.tobytes() and not np.array_equal(again, given, equal_nan=True):
-            column = int(((again != given) & ~(np.isnan(again) & np.isnan(given))).argmax())
+        if (off := unlike(again, given)).any():
+            column = int(off.argmax())
             raise BadInput(
                 f"{self.name} has observed {given[column]:.6g} in observation[{column}], and "
                 f"{self.spec.observers[0]}() gives {again[column]:.6g} in the same state: let it compute all "
@@ -484,8 +484,7 @@ class Instance:
         """
         seen = self.seen_as("now", state, noise)
         fresh.physics.write(self.moved(state, noise))
-        usual = flat(fresh.watched(), self.inner.observation_space)
-        return np.asarray((seen != usual) & ~(np.isnan(seen) & np.isnan(usual)))
+        return unlike(seen, flat(fresh.watched(), self.inner.observation_space))
 
     def moved(self, state: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Returns a state of MuJoCo (S,) with noise (d,) added to the coordinates of the chart."""

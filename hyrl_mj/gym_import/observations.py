@@ -39,6 +39,11 @@ def flat(observation: Any, space: spaces.Space[Any]) -> np.ndarray:
     return np.array(observation, dtype=float).ravel()
 
 
+def unlike(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Returns where two observations differ, (o,) bool; NaN does not differ from NaN."""
+    return np.asarray((a != b) & ~(np.isnan(a) & np.isnan(b)))
+
+
 def _keyed(space: spaces.Space[Any]) -> list[tuple[Any, Any]]:
     """Returns the parts of a Dict or a Tuple with the keys by which observations hold them."""
     if isinstance(space, spaces.Dict):

@@ -19,6 +19,7 @@ from hyrl_mj.files import trust
 from hyrl_mj.gym_import import fingerprint as written
 from hyrl_mj.gym_import.coordinates import own_of
 from hyrl_mj.gym_import.instance import OF_STATE, Instance, Passed, outlasting
+from hyrl_mj.gym_import.observations import unlike
 from hyrl_mj.gym_import.specification import EnvironmentSpec
 from hyrl_mj.system import limits
 from hyrl_mj.tasks import Outcome
@@ -207,13 +208,12 @@ class Stage:
                 told.append(sample.observation)
         self._elsewhere.append(other)
         for k, (seen, shown) in enumerate(zip(run.observations, told, strict=False)):
-            if not np.array_equal(seen, shown, equal_nan=True):
-                column = int(((seen != shown) & ~(np.isnan(seen) & np.isnan(shown))).argmax())
+            if (off := unlike(seen, shown)).any():
                 raise BadInput(
-                    f"a wrapper of {self.spec.name} shows in observation[{column}], after {k} sample(s), "
-                    "more of the robot than the environment observes, as from info, the reward, an attribute "
-                    "or MuJoCo's state, where noise does not come: let it observe what the environment "
-                    "observes, or let the environment observe that"
+                    f"a wrapper of {self.spec.name} shows in observation[{off.argmax()}], after {k} "
+                    "sample(s), more of the robot than the environment observes, as from info, the reward, "
+                    "an attribute or MuJoCo's state, where noise does not come: let it observe what the "
+                    "environment observes, or let the environment observe that"
                 )
 
     def _live(self, run: Played, as_it_is: bool) -> None:

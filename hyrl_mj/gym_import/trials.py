@@ -13,7 +13,7 @@ import numpy as np
 from hyrl_mj.errors import BadInput
 from hyrl_mj.gym_import.coordinates import own_of
 from hyrl_mj.gym_import.instance import Instance, Seen, renewed, to_end
-from hyrl_mj.gym_import.observations import flat, observers, shaped
+from hyrl_mj.gym_import.observations import flat, observers, shaped, unlike
 from hyrl_mj.gym_import.plant import EnvironmentPlant, check_finite
 from hyrl_mj.gym_import.pool import Pool
 from hyrl_mj.gym_import.resets import SAME
@@ -61,9 +61,8 @@ def _agrees(get: Any, seen: np.ndarray, space: Any) -> bool:
 
 def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Returns the differences (o,) of two observations; equal values that are not finite do not differ."""
-    same = (a == b) | (np.isnan(a) & np.isnan(b))
     with np.errstate(invalid="ignore"):
-        return np.where(same, 0.0, np.abs(a - b))
+        return np.where(unlike(a, b), np.abs(a - b), 0.0)
 
 
 def _rounds(off: np.ndarray, values: np.ndarray) -> np.ndarray:
