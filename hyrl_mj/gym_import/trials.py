@@ -324,7 +324,7 @@ def check_episodes(pool: Pool) -> None:
 
 def check_noise(pool: Pool) -> None:
     """Raises `BadInput` unless instances go as new ones under noise."""
-    pool.check(_episodes(pool, 5, 2 * EPISODES, MOVED))
+    pool.check([run for seed in (5, 6) for run in _episodes(pool, seed, EPISODES, MOVED)])
 
 
 def _episodes(pool: Pool, seed: int, n: int, share: float = 0.0) -> list[Played]:
