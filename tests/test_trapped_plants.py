@@ -158,6 +158,19 @@ def test_what_cannot_be_used_is_refused(tmp_path, trap):
             "LOW()",
             "methods change y of LOW when",
         ),
+        ("class Count:\n    n = 0", "Count.n += 1", "methods change n of Count when"),
+        (
+            "class A:\n    n = 0\n\n\nclass B:\n    a = A()\n\n\nROOM = B()",
+            "ROOM.a.n += 1",
+            "methods change n of a of (ROOM|B) when",
+        ),
+        ("KEPT = (np.zeros(1),)", "KEPT[0][0] += 1", "methods change 0 of KEPT when"),
+        ("KEPT = SimpleNamespace(n=0)", "KEPT.n += 1", "methods change n of KEPT when"),
+        (
+            "def made():\n    n = 0\n    while True:\n        n += 1\n        yield n\n\n\nKEPT = made()",
+            "next(KEPT)",
+            "methods change n of KEPT when",
+        ),
         ("", "ends[np.random.random(len(x)) < 1e-9] = 2", "draw from a global generator"),
         ("", "ends[(x > 1) & (np.random.default_rng().random(len(x)) < 0.02)] = 2", "the same row"),
         (
@@ -172,6 +185,7 @@ def test_what_a_file_remembers_or_draws_is_refused(tmp_path, monkeypatch, room, 
         trapped_plants,
         "TASK",
         "import functools\nimport itertools\nfrom collections import deque\n"
+        "from types import SimpleNamespace\n"
         + TASK.replace("class Robot", f"{room}\n\nclass Robot"),
     )
     for name in ("counting", "ticking"):
@@ -179,6 +193,37 @@ def test_what_a_file_remembers_or_draws_is_refused(tmp_path, monkeypatch, room, 
         (tmp_path / f"{name}.py").write_text(text)
     with pytest.raises(BadInput, match=says):
         check_task(task_of(ends(vehicle(), code), tmp_path))
+
+
+BOOL = "    {}def ending({}measured):\n        return np.abs(measured[:, 1]) > 1\n"
+WRONG = "gives bool from False to (False|True): give a hyrl_mj.Outcome"
+NO_METHOD = "its ending is no method of its class, or was put there later"
+
+
+@pytest.mark.parametrize(
+    ("before", "inside", "after", "says"),
+    [
+        ("class Mixin:\n" + BOOL.format("", "self, "), "", "", WRONG),
+        ("", BOOL.format("@staticmethod\n    ", ""), "", WRONG),
+        ("", "    ending = functools.partialmethod(lambda self, m: m)\n", "", NO_METHOD),
+        (
+            "",
+            "    def __init__(self):\n        self.ending = lambda m: m[:, 1] > 1\n",
+            "",
+            NO_METHOD,
+        ),
+        ("", "", "\nRobot.ending = lambda self, m: m[:, 1] > 1\n", NO_METHOD),
+    ],
+)
+def test_a_method_from_elsewhere_is_looked_at_too(
+    tmp_path, monkeypatch, before, inside, after, says
+):
+    own = TASK[TASK.index("    def ending") : TASK.index("    def direction")]
+    text = TASK.replace("class Robot(", f"{before}\n\nclass Robot({'Mixin, ' * bool(before)}")
+    text = text.replace(own, inside + own * ("self.ending" in inside or bool(after)))
+    monkeypatch.setattr(trapped_plants, "TASK", "import functools\n" + text + after)
+    with pytest.raises(BadInput, match=says):
+        check_task(task_of(vehicle(), tmp_path))
 
 
 def test_what_is_filled_once_or_anew_each_time_is_no_memory(tmp_path, monkeypatch):

@@ -389,6 +389,19 @@ def test_the_activation_of_the_keyframe_holds(tmp_path):
     assert plant.qpos[0, 0] > 0.5
 
 
+def test_the_time_begins_as_in_the_keyframe(tmp_path):
+    def text(xml):
+        return xml.replace("</sensor>", "<clock/></sensor>").replace("<key ", '<key time="2" ')
+
+    ends = "ends = np.where(measured[:, 0] >= 3, Outcome.REACHED, 0)"
+    own = {"noisy": "(False, True, False)", "ending": ends, "observation": "return measured[:, :2]"}
+    task = get_task(write(tmp_path, own, text=text))
+    assert judge_task(task) == 50
+    plant = task.placed(np.zeros((1, 2)))
+    plant.step(np.zeros((1, 1)))
+    np.testing.assert_allclose(plant.measurement[0, 2], 2 + task.dt)
+
+
 def test_sleeping_models_are_refused_with_a_sentence(tmp_path):
     sleeps = CALM.replace("/>", ' sleep="enable"/>')
     task = get_task(write(tmp_path, text=lambda xml: xml.replace(CALM, sleeps)))

@@ -85,6 +85,8 @@ class Plant:
             self._stage = mujoco.mjtStage(int(self.model.sensor_needstage.max()))
         self._open()
         self._drive(np.arange(n))
+        if model.nkey:  # a clock measures the time
+            self._batch.bind("time")[:] = model.key_time[0]
         if model.nkey and model.na:
             self._batch.bind("act")[:] = model.key_act[0]
         self._initial = self._batch.state[0].copy()

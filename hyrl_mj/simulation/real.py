@@ -166,6 +166,7 @@ def _played(
     data.qvel[:] = 0.0 if qvel is None else qvel
     mujoco.mj_normalizeQuat(model, data.qpos)
     if model.nkey:
+        data.time = model.key_time[0]
         data.ctrl[:] = model.key_ctrl[0]
         data.act[:] = model.key_act[0]
     loop = task.has_inner_loop

@@ -16,6 +16,7 @@ from hyrl_mj.sets import MOST_DIMENSIONS, Chart
 from hyrl_mj.tasks import trial
 from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.description import SEARCHES, Learning, Mirror, Outcome, Scene
+from hyrl_mj.tasks.guard import unguarded
 from hyrl_mj.tasks.mirrored import try_mirror
 
 # Number of starts that are tried, and of places at which robot and obstacles may overlap.
@@ -150,6 +151,11 @@ def _rounded(x: float, way: np.ufunc) -> float:
 
 def _check_names(task: Task) -> None:
     """Raises `BadInput` if a user's task has a name of its own for what the package computes."""
+    for name in unguarded(task):
+        raise BadInput(
+            f"its {name} is no method of its class, or was put there later: define it there, as "
+            f"def {name}(self, ...)"
+        )
     own = (kind for kind in type(task).__mro__ if not kind.__module__.startswith("hyrl_mj."))
     names = {name for kind in own for name in vars(kind)}
     if task.source is not None and (taken := sorted(names.intersection(COMPUTED))):

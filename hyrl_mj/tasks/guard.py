@@ -10,8 +10,9 @@ import math
 from collections.abc import Callable
 from contextlib import suppress
 from functools import wraps
-from inspect import isfunction
+from inspect import getattr_static, isfunction
 from typing import TYPE_CHECKING, Any
+from weakref import WeakSet
 
 import numpy as np
 
@@ -40,11 +41,40 @@ COLUMNS = {
 }
 
 
+METHODS = (*COLUMNS, "measure", "state", "control", "mocap")
+DEFAULTS = "hyrl_mj.tasks.base"  # the module of those that need no guard
+_GUARDS: WeakSet[Callable[..., Any]] = WeakSet()
+
+
 def guard(kind: type[Task]) -> None:
-    """Guards the methods that a subclass of `Task` defines itself."""
-    for name in (*COLUMNS, "measure", "state", "control", "mocap"):
-        if isfunction(method := vars(kind).get(name)):
-            setattr(kind, name, _guarded(name, method))
+    """Guards the methods of a subclass of `Task`, also those of classes that are no tasks."""
+    for name in METHODS:
+        method = getattr_static(kind, name)
+        if isinstance(method, staticmethod):
+            method = _of_object(method.__func__)
+        if isfunction(method) and not _is_guarded(method):
+            setattr(kind, name, guarded := _guarded(name, method))
+            _GUARDS.add(guarded)
+
+
+def unguarded(task: Task) -> list[str]:
+    """Returns the names of methods that are none of the class as it was made, so that nothing guards them."""
+    kind = type(task)
+    return [n for n in METHODS if n in vars(task) or not _is_guarded(getattr_static(kind, n))]
+
+
+def _is_guarded(method: Any) -> bool:
+    return isfunction(method) and (method in _GUARDS or method.__module__ == DEFAULTS)
+
+
+def _of_object(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Returns a static method as one of an object."""
+
+    @wraps(function)
+    def method(self: Task, *args: Any, **kwargs: Any) -> Any:
+        return function(*args, **kwargs)
+
+    return method
 
 
 def read_only(value: Any) -> Any:

@@ -8,11 +8,11 @@ import pickle
 import random
 import sys
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import count, product
-from types import FunctionType
+from types import FunctionType, GeneratorType, SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -32,6 +32,7 @@ from hyrl_mj.tasks.registry import alike, made_again
 STEPS, FEWEST = 200_000, 16
 STARTS = 32  # as training draws them
 ANYWHERE = 4_000  # places at which a task that is made again has to be the same
+MOST_HELD = 1_000  # entries of a list or the like that are looked at one by one
 # Samples after which an input must have changed something.
 EFFECT = 10
 # Number of the sample -> inputs (n, m).
@@ -151,7 +152,9 @@ def _check_unchanged(task: Task, before: Mapping[str, Any], now: Mapping[str, An
     """Raises `BadInput` if variables have changed since they were copied, but what is computed once."""
     after = _copied(now)
     lazy = {name for name in after if isinstance(getattr(type(task), name, None), cached_property)}
-    for name in after.keys() - lazy:
+    for name in after:  # the outer ones first
+        if name in lazy:
+            continue
         if name not in before or not alike(before[name], after[name]):
             raise BadInput(
                 f"its methods change {name} when they are asked: a task remembers nothing, so compute it "
@@ -160,10 +163,9 @@ def _check_unchanged(task: Task, before: Mapping[str, Any], now: Mapping[str, An
 
 
 def _shared(task: Task) -> dict[str, Any]:
-    """Returns the variables of a task, of its class and of its code, by name.
+    """Returns the variables of a task, of its class and of its code, by name, with all that these hold.
 
-    That is the file that defines it, and what this imports from its folder. With them are what functions
-    keep, and the attributes of objects of classes that are defined there.
+    That is the file that defines it, and what this imports from its folder.
     """
     kinds = [kind for kind in type(task).__mro__ if not kind.__module__.startswith("hyrl_mj.")]
     # A session of its user's may hold anything.
@@ -172,17 +174,41 @@ def _shared(task: Task) -> dict[str, Any]:
     modules = [sys.modules[name] for name in names if name in sys.modules]
     rooms = [*modules, *kinds, task]
     found = {n: v for room in rooms for n, v in vars(room).items() if not n.startswith("__")}
-    for name, value in [*found.items()]:
-        kept: dict[str, Any] = {}
-        if isinstance(value, FunctionType):
-            with suppress(TypeError, ValueError):  # what it wraps may be no function of Python
-                for function in (value, inspect.unwrap(value)):
-                    kept |= {**inspect.getclosurevars(function).nonlocals, **vars(function)}
-                    kept["a default"] = [function.__defaults__, function.__kwdefaults__]
-        elif type(value).__module__ in names:
-            kept = getattr(value, "__dict__", {})
-        found |= {f"{n} of {name}": v for n, v in kept.items()}
+    left, seen = [*found.items()], {id(room) for room in rooms}
+    while left:
+        name, value = left.pop()
+        if id(value) not in seen:
+            seen.add(id(value))
+            held = {f"{n} of {name}": v for n, v in _held(value, names).items()}
+            found |= held
+            left += held.items()
     return found
+
+
+def _held(value: Any, names: Collection[str]) -> dict[str, Any]:
+    """Returns what a function keeps, or what an object holds, or a class, of modules of these names."""
+    if isinstance(value, FunctionType):
+        with suppress(TypeError, ValueError):  # what it wraps may be no function of Python
+            kept: dict[str, Any] = {}
+            for function in (value, inspect.unwrap(value)):
+                kept |= {**inspect.getclosurevars(function).nonlocals, **vars(function)}
+                kept["a default"] = [function.__defaults__, function.__kwdefaults__]
+            return kept
+    if isinstance(value, partial):
+        return {"func": value.func, "the arguments": [value.args, value.keywords]}
+    if isinstance(value, GeneratorType):
+        return inspect.getgeneratorlocals(value)
+    if isinstance(value, list | tuple | dict) and len(value) <= MOST_HELD:
+        return {
+            str(n): v for n, v in (value.items() if isinstance(value, dict) else enumerate(value))
+        }
+    of_class = value if isinstance(value, type) else type(value)
+    if of_class.__module__ not in names and of_class is not SimpleNamespace:
+        return {}
+    slots = [slot for kind in of_class.__mro__ for slot in getattr(kind, "__slots__", ())]
+    held = {slot: getattr(value, slot) for slot in slots if hasattr(value, slot)}
+    held |= getattr(value, "__dict__", {})
+    return {n: v for n, v in held.items() if not n.startswith("__")}
 
 
 def _copied(variables: Mapping[str, Any]) -> dict[str, Any]:
