@@ -1,5 +1,7 @@
 """A chart knows which points are the same, and how far apart two are, on circles and off them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from drawn import points
@@ -62,6 +64,13 @@ def test_distances_are_between_points_divided_by_the_scale():
     a, b = np.array([[PI - 0.1, 0.0], [0.0, 0.0]]), np.array([[0.1 - PI, 0.0], [0.0, 1.5]])
     np.testing.assert_allclose(chart.distance(a, b), [0.4, 0.5])
     assert CHARTS["tube"].scale == (1.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("scale", "unit"), [((), "rad, m"), ((0.5, 1), "m"), ((0.5, 2), "scaled units")]
+)
+def test_distances_have_the_unit_of_what_is_not_scaled(scale, unit):
+    assert replace(CHARTS["tube"], scale=scale).unit == unit
 
 
 def test_a_point_is_named_with_its_units():

@@ -113,6 +113,14 @@ MISTAKES = {
     "a gear too large": ((XML, 'kv="12"', 'kv="12" gear="1e12"'), "breaks down under"),
     "a body pushed apart": ((XML, 'gravity="0 0 0"', 'gravity="1e12 0 0"'), "breaks down under"),
     "noise on nothing": ((PY, r"noisy = .*\n", "noisy = (0, 0, 0, 0)\n"), "a share > 0"),
+    "noise that no network sees": (
+        (PY, r"noisy = .*\n", "noisy = (0, 0, 0, 1)\n"), r"noisy columns \[3\].*no network would see it"
+    ),
+    "a plane seen from behind": (
+        (PY, r"    def miss", "    plane = (1, 0)\n\n    def miss"), r"plane is \(1, 0\).*in this order"
+    ),
+    "sides exchanged": ((PY, r'\("left", "right"\)', '("Right", "Left")'), "passes the obstacle on its left"),
+    "centimetres of metres": ((PY, r'\("m", "m"\)', '("m", "cm")'), "y is said to be in cm.*: say m"),
     "a mirror that is no symmetry": ((PY, r"\(1, -1, -1\)", "(1, 1, 1)"), "mirror is no symmetry of it"),
     "an input without effect": ((XML, 'kv="12"', 'kv="0"'), "input lateral changes nothing"),
     "a link too heavy": ((XML, 'mass="1"', 'mass="1e300"'), "input lateral changes nothing"),

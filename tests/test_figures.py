@@ -316,6 +316,16 @@ def test_extended_sets_of_a_plane():
     assert near.get_ylim() == pytest.approx((-0.4, 0.4))
 
 
+@pytest.mark.parametrize("share", [0.5, 0.0])
+def test_noise_is_drawn_as_wide_as_its_share_of_the_bound(share):
+    task = VEHICLE.with_noise((0.0, share))
+    near = figures.draw_extended_sets(shown_of(task, arcs_of(task))).axes[1]
+    rooms = lines_of(near, colours.BAD)
+    assert len(rooms) == (share > 0)
+    for room in rooms:
+        assert np.ptp(room[:, 1]) == pytest.approx(2 * share * EPS)
+
+
 def test_extended_sets_of_a_ring_have_their_ends_in_multiples_of_pi():
     figure = draw("extended_sets", CIRCLE)
     (panel,) = figure.axes

@@ -17,7 +17,7 @@ from hyrl_mj.pipeline.runs import settings_of
 from hyrl_mj.pipeline.steps import run_stage
 from hyrl_mj.policies import MlpPolicy
 from hyrl_mj.runs.directory import opened
-from hyrl_mj.tasks import Outcome, hidden_goal, overlooked
+from hyrl_mj.tasks import Outcome, hidden_goal, jumped_over, overlooked
 from hyrl_mj.tasks.scaffold import write_task
 from hyrl_mj.viz import figures
 
@@ -163,9 +163,29 @@ def test_a_second_obstacle_of_the_template_is_a_crash_and_a_forgotten_one_is_tol
     assert bool(said) == forgotten
 
 
-def test_no_task_of_the_package_overlooks_an_obstacle():
+def test_no_task_of_the_package_overlooks_an_obstacle_or_jumps_over_it():
     tasks = [hyrl_mj.get_task(name) for name in hyrl_mj.task_names()]
-    assert not [task for task in tasks if task.source is None and overlooked(task)]
+    assert not [t for t in tasks if t.source is None and (overlooked(t) or jumped_over(t))]
+
+
+@pytest.mark.parametrize(
+    ("end", "jumps"),
+    [
+        ("np.abs(x - 2.2) < 0.004", True),
+        ("np.hypot(x - 2.2, y - 1.0) < 0.01", True),
+        ("np.hypot(x - 2.2, y - 1.0) < 0.1", False),
+        ("(np.abs(x - 2.2) < 0.1) & (y > 1.0)", False),
+    ],
+)
+def test_what_is_thinner_than_a_sample_leads_is_told(vehicle, monkeypatch, end, jumps):
+    ends = type(vehicle).ending
+
+    def ending(self, measured):
+        x, y = measured.T  # noqa: RUF059 - the end looks at them
+        return np.where(eval(end), Outcome.CRASHED, ends(self, measured))
+
+    monkeypatch.setattr(type(vehicle), "ending", ending)
+    assert bool(re.search(r"jumps over .* from x = 2\.1", jumped_over(vehicle))) == jumps
 
 
 def test_a_set_point_that_noise_hides_is_told_with_what_would_do(circle):

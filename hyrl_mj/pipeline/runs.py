@@ -33,6 +33,7 @@ from hyrl_mj.tasks import (
     check_task,
     get_task,
     hidden_goal,
+    jumped_over,
     overlooked,
 )
 from hyrl_mj.viz import beginning
@@ -250,7 +251,9 @@ def _run_all(run: Run, say: Say, stages: Collection[str] = STAGES, learned: bool
         say(f"the run will be examined {examination_plan(run)}")
     s = run.settings
     if not run.manifest.is_done("train"):
-        for caution in (overlooked(run.task), hidden_goal(run.task, s.eps, s.everywhere)):
+        task = run.task
+        cautions = overlooked(task), jumped_over(task), hidden_goal(task, s.eps, s.everywhere)
+        for caution in cautions:
             if caution:
                 say(caution)
     if "partition" in stages and not run.manifest.is_done("partition"):

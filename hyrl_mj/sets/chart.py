@@ -58,6 +58,12 @@ class Chart:
     def dimension(self) -> int:
         return len(self.names)
 
+    @property
+    def unit(self) -> str:
+        """The unit of distances: that of the coordinates with scale 1."""
+        own = dict.fromkeys(u for u, s in zip(self.units, self.scale, strict=True) if s == 1)
+        return ", ".join(own) or "scaled units"
+
     def draw(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """Returns random points (n, d) all over the charted box."""
         return rng.uniform(self.low, self.high, (n, self.dimension))

@@ -65,7 +65,7 @@ class CriticalSet(Saved):
         if not len(self.points):
             return (
                 f"no critical set found at this resolution (grid {self.spacing:.3g}, pairs down to "
-                f"{self.resolution:.3g} {task.chart.units[0]})"
+                f"{self.resolution:.3g} {task.chart.unit})"
             )
         return f"critical set of {self._counts}, {ranges(task.chart, self.points, self.resolution)}"
 

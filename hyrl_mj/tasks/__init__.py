@@ -8,7 +8,7 @@ from importlib import import_module
 from pkgutil import iter_modules
 
 from hyrl_mj.tasks.base import Task, at_levels
-from hyrl_mj.tasks.checks import check_task, hidden_goal, overlooked
+from hyrl_mj.tasks.checks import check_task, hidden_goal, jumped_over, overlooked
 from hyrl_mj.tasks.description import (
     SEARCHES,
     SPARING,
@@ -78,6 +78,7 @@ __all__ = [
     "described_task",
     "get_task",
     "hidden_goal",
+    "jumped_over",
     "largest_moves",
     "length",
     "number_of",

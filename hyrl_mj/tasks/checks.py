@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hyrl_mj.errors import BadInput, brief, line_in
-from hyrl_mj.physics import memory, mjcf
+from hyrl_mj.physics import memory, mjcf, mujoco_log
 from hyrl_mj.ranges import Flag, Integer, Number, OneOf, Optional, Rule, Several, Text
 from hyrl_mj.sets import MOST_DIMENSIONS, Chart
 from hyrl_mj.tasks import trial
@@ -18,10 +18,13 @@ from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.description import SEARCHES, Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.guard import unguarded
 from hyrl_mj.tasks.mirrored import try_mirror
+from hyrl_mj.tasks.obstacles import SIDES
 
 # Number of starts that are tried, and of places at which robot and obstacles may overlap.
 STARTS, OVERLAPS = 64, 512
 NEARER = (0.1, 0.01, 0.001)
+WHOLE_TURN_OF_OTHERS = {"rad": 360.0, "deg": 2 * np.pi, "°": 2 * np.pi}
+HOPS = 10  # samples of runs in which it is looked for what is jumped over
 LONGEST = 3_600  # time that is shown [s]
 # What the values of a task's attributes may be.
 RULES: dict[str, Rule] = {
@@ -104,6 +107,52 @@ def overlooked(task: Task) -> str:
                         "episode end there"
                     )
     return ""
+
+
+def jumped_over(task: Task) -> str:
+    """Returns where a robot jumps between two samples over what would end its episode; "" if nowhere.
+
+    That is a wall or a post: as far to the left of the middle of it as a sample leads there is the same as to
+    the right. Beside a corner that is cut, or a round obstacle that is grazed, one side is free.
+    """
+    if type(task).plant is not Task.plant:
+        return ""
+    rng, chart = np.random.default_rng(0), task.chart
+    z = chart.draw(4 * OVERLAPS, rng)
+    z = z[task.goes_on(z)]
+    plant, u = task.placed(z, rng), task.draw_inputs(len(z), rng)
+    with mujoco_log.kept():
+        for _ in range(HOPS):
+            before = plant.measurement
+            plant.step(u)
+            after = plant.measurement
+            on = (task.ending(before) == Outcome.RUNNING) & ~task.failed(after) & ~plant.unstable
+            z, seen = task.z(before)[on], after[on]
+            hop = chart.difference(task.z(seen), z)
+            for share in np.linspace(0, 1, 11)[1:-1]:
+                middle = z + share * hop
+                hit = np.flatnonzero(task.failed(task.with_z(seen, middle)))
+                for row in hit[_is_thin(task, seen[hit], middle[hit], hop[hit])]:
+                    return (
+                        f"between two samples {task.name} jumps over what ends an episode, as from "
+                        f"{chart.format(z[row])} to {chart.format((z + hop)[row])}: ending() sees it at "
+                        "samples alone, so make that wider, or the sample time shorter"
+                    )
+    return ""
+
+
+def _is_thin(task: Task, seen: np.ndarray, z: np.ndarray, hop: np.ndarray) -> np.ndarray:
+    """Returns whether both or neither of the sides fail, a hop (n, d) away from failures z: (n,) bool."""
+    thin, scale = np.ones(len(z), dtype=bool), np.array(task.chart.scale)
+    way = np.linalg.norm(hop / scale, axis=1, keepdims=True)
+    along = hop / scale / np.maximum(way, 1e-12)
+    for axis in np.eye(len(scale)):
+        across = axis - along * (along @ axis)[:, None]
+        size = np.linalg.norm(across, axis=1, keepdims=True)
+        aside = way * scale * across / np.maximum(size, 1e-12)
+        left, right = (task.failed(task.with_z(seen, z + side)) for side in (aside, -aside))
+        thin &= (left == right) | (size[:, 0] < 0.5)  # mostly along it
+    return thin & (way[:, 0] > 0)
 
 
 def hidden_goal(task: Task, eps: float, everywhere: bool = False) -> str:
@@ -250,6 +299,10 @@ def _check_scene(task: Task) -> None:
         return
     if isinstance(names, str) or len(names) < 2 or not all(isinstance(n, str) for n in names):
         raise BadInput(f"scene.mode_names is {names!r}: name two or more")
+    if not task.gives_direction and tuple(name.lower() for name in names) == SIDES[::-1]:
+        raise BadInput(
+            f"scene.mode_names is {names!r}, and mode 0 passes the obstacle on its left: exchange them"
+        )
 
 
 def _check_training(task: Task) -> None:
@@ -344,6 +397,7 @@ def _check_starts(task: Task) -> None:
         everywhere = task.placed(anywhere).measurement
         _check_round_trip(task, anywhere, task.z(everywhere))
         _check_noise_of_chart(task, everywhere)
+        _check_noise_is_seen(task, everywhere)
     if type(task).plant is Task.plant:
         _check_turns(task, np.vstack([z, task.chart.draw(STARTS, np.random.default_rng(4))]))
         z, measurement = drawn, task.placed(drawn).measurement  # of which few may be over
@@ -393,6 +447,12 @@ def _check_turns(task: Task, z: np.ndarray) -> None:
             raise BadInput(
                 f"its chart says that {chart.names[axis]} is periodic, and joint {joint} has a range, which "
                 "stops it: leave the range out, or say that it is not periodic"
+            )
+        unit, side = chart.units[axis].strip("[] ").lower()[:3], chart.sides[axis]
+        if abs(side - WHOLE_TURN_OF_OTHERS.get(unit, 0.0)) < 0.01:
+            raise BadInput(
+                f"its chart says that {chart.names[axis]} is in {chart.units[axis]} and comes back after "
+                f"{side:.6g}: a whole turn is 360 in degrees and 2 pi in rad, so correct one of them"
             )
         off = np.abs(seen(z + turn) - seen(z)).max(axis=1)
         if off.max() > 1e-3:  # 3.1416 will do
@@ -444,6 +504,22 @@ def _check_noise_of_chart(task: Task, measurement: np.ndarray) -> None:
         )
 
 
+def _check_noise_is_seen(task: Task, measurement: np.ndarray) -> None:
+    """Raises `BadInput` if noise in the noisy columns changes no observation of measurements (n, p)."""
+    shares = np.array(task.noisy, dtype=float)
+    # As much as moves the chart by a hundredth of its sides.
+    with np.errstate(divide="ignore"):
+        bound = float((task.chart.sides / shares[: task.chart.dimension]).min()) / 100
+    drawn = np.random.default_rng(0).uniform(-1, 1, measurement.shape)
+    noisy = measurement + min(bound, 1.0) * shares * drawn
+    if np.array_equal(task.observation(noisy), task.observation(measurement)):
+        raise BadInput(
+            f"noise in the noisy columns {np.flatnonzero(shares).tolist()} of the measurement changes no "
+            "observation, so that no network would see it: let observation() use them, or say in noisy "
+            "which columns it uses"
+        )
+
+
 def _check_box(task: Task) -> np.ndarray:
     """Returns starts (n, d) that are drawn; raises `BadInput` unless the task says that they may be."""
     drawn = task.starts(task.effort.starts, np.random.default_rng(2))
@@ -465,8 +541,10 @@ def _check_ways(task: Task) -> None:
         raise BadInput(
             f'{task.model_path.name} has no obstacle: begin the name of a geom with "obstacle", {own}'
         )
-    if len(set(task.plane)) != 2 or not set(task.plane) <= {0, 1, 2}:
-        raise BadInput(f"plane is {task.plane!r}: give two of the axes 0 (x), 1 (y) and 2 (z)")
+    if [*task.plane] not in ([0, 1], [0, 2], [1, 2]):  # seen from behind, left would be right
+        raise BadInput(
+            f"plane is {task.plane!r}: give two of the axes 0 (x), 1 (y) and 2 (z), in this order"
+        )
     if type(task).where is Task.where and task.chart.dimension < 2:
         raise BadInput(
             f"its chart has one coordinate ({task.chart.names[0]}), and ways past obstacles are told apart "

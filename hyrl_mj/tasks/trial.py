@@ -32,6 +32,7 @@ from hyrl_mj.tasks.registry import alike, made_again
 STEPS, FEWEST = 200_000, 16
 STARTS = 32  # as training draws them
 ANYWHERE = 4_000  # places at which a task that is made again has to be the same
+NO_METRES = ("um", "mm", "cm", "dm", "km", "in", "ft", "rad", "deg", "°")
 MOST_HELD = 1_000  # entries of a list or the like that are looked at one by one
 # Samples after which an input must have changed something.
 EFFECT = 10
@@ -369,6 +370,12 @@ def try_place(task: Task) -> None:
             f"{task.plane} of the world, in metres: give the task a where(measured), or name another point "
             "in scene.tracked"
         )
+    for name, unit in zip(task.chart.names[:2], task.chart.units, strict=False):
+        if unit.strip("[] ").lower() in NO_METRES:
+            raise BadInput(
+                f"its chart's {name} is said to be in {unit}, and it is the place of {tracked} in metres: "
+                "say m"
+            )
 
 
 def _samples(task: Task) -> int:

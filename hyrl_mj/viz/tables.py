@@ -240,7 +240,7 @@ def miss_unit(task: Task) -> str:
     own = (
         task.source is not None and type(task).miss is not Task.miss
     )  # which may tell metres of angles
-    return "as miss() tells" if own else ", ".join(dict.fromkeys(task.chart.units))
+    return "as miss() tells" if own else task.chart.unit
 
 
 def margin_table(task: Task, game: GameResult) -> Table:

@@ -118,20 +118,24 @@ def _set_plane(panel: Axes, shown: ShownRun, shared: np.ndarray) -> None:
 def _enlarge(whole: Axes, near: Axes, shown: ShownRun) -> None:
     """Shows four noise bounds around M* in the second panel, with the width that noise requires."""
     section, points, eps = shown.section, shown.critical.points, shown.sets.eps
-    low = np.maximum(points.min(axis=0) - 4 * eps, section.chart.low)
-    high = np.minimum(points.max(axis=0) + 4 * eps, section.chart.high)
+    noise = section.noise(eps)
+    around = 4 * np.where(noise > 0, noise, eps)
+    low = np.maximum(points.min(axis=0) - around, section.chart.low)
+    high = np.minimum(points.max(axis=0) + around, section.chart.high)
     near.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), title="around M*")
     box = Rectangle(low, *(high - low), fill=False, edgecolor=INK, linestyle=":", zorder=3)
     whole.add_patch(box)
     for drawn in near.lines:
         drawn.set_clip_on(True)  # marks outside this panel would show beside it
+    if not noise.any():  # it acts on other coordinates of the chart
+        return
     # The width is drawn at the middle one of M*'s points.
     middle = points[np.argsort(points.sum(axis=1))[len(points) // 2]]
     # Of the noisy coordinates, that across M*.
-    noisy = section.noise(1.0) > 0
-    axis = int(np.where(noisy, np.ptp(points, axis=0), np.inf).argmin())
-    step = eps * np.eye(2)[axis]
+    axis = int(np.where(noise > 0, np.ptp(points, axis=0), np.inf).argmin())
+    step = noise * np.eye(2)[axis]
     ends = np.stack([middle - step, middle + step]).T
     looks: dict[str, Any] = {"color": BAD, "linewidth": 2, "markersize": 9, "zorder": 4}
-    label = f"2 eps = {2 * eps:g} {section.chart.units[axis]}"
+    name, unit = section.chart.names[axis], section.chart.units[axis]
+    label = f"twice the noise on {name}: {2 * noise[axis]:g} {unit}"
     near.plot(*ends, marker="_|"[axis == 0], label=label, **looks)
