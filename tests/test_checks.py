@@ -113,6 +113,9 @@ MISTAKES = {
     "a gear too large": ((XML, 'kv="12"', 'kv="12" gear="1e12"'), "breaks down under"),
     "a body pushed apart": ((XML, 'gravity="0 0 0"', 'gravity="1e12 0 0"'), "breaks down under"),
     "noise on nothing": ((PY, r"noisy = .*\n", "noisy = (0, 0, 0, 0)\n"), "a share > 0"),
+    "a share of noise on nothing as a whole": (
+        (PY, r"noisy = .*\n", "noisy = (0, 0.5, 0, 0)\n"), "noise of none of x and y: divide it by 0.5"
+    ),
     "noise that no network sees": (
         (PY, r"noisy = .*\n", "noisy = (0, 0, 0, 1)\n"), r"noisy columns \[3\].*no network would see it"
     ),

@@ -221,3 +221,10 @@ def test_vehicle_state_outside_the_arena(vehicle, z):
         vehicle.chart.check([(0.0, 0.0), z], vehicle.name)
     assert f"x = {z[0]:g} m, y = {z[1]:g} m" in str(caught.value)
     assert "state 1" in str(caught.value)
+
+
+def test_the_unit_of_a_noise_bound_is_that_of_the_coordinates_it_acts_on_as_a_whole(vehicle):
+    turned = vehicle.with_noise((57.3, 1.0))
+    turned.chart = replace(vehicle.chart, units=("deg", "m"))
+    assert turned.noise_on() == ("x and y", "m")
+    assert turned.noise_text(0.1) == "5.73 deg on x, 0.1 m on y"

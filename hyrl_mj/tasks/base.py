@@ -445,7 +445,8 @@ class Task(ABC):
     def noise_on(self, everywhere: bool = False) -> tuple[str, str]:
         """Returns the chart coordinates that noise acts on, and the unit of its bound: "x and y", "m"."""
         shares = self.noise_in_chart(1.0, everywhere)
-        units = dict.fromkeys(compress(self.chart.units, shares == shares.max()))
+        whole = shares == (1 if (shares == 1).any() else shares.max())
+        units = dict.fromkeys(compress(self.chart.units, whole))
         return listed([*compress(self.chart.names, shares > 0)]), ", ".join(units)
 
     def noise_text(self, bound: float, everywhere: bool = False) -> str:

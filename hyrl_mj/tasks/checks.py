@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hyrl_mj.errors import BadInput, brief, line_in
+from hyrl_mj.errors import BadInput, brief, line_in, listed
 from hyrl_mj.physics import memory, mjcf, mujoco_log
 from hyrl_mj.ranges import Flag, Integer, Number, OneOf, Optional, Rule, Several, Text
 from hyrl_mj.sets import MOST_DIMENSIONS, Chart
@@ -285,6 +285,12 @@ def _check_parts(task: Task) -> None:
     if not any(Several(Number(0, 1e6), d, 1_000).checked("noisy", shares)):
         raise BadInput(
             f"noisy is {task.noisy}: give a share > 0 of the noise bound for one column or more"
+        )
+    # Tables and figures give the bound as the noise of the coordinates with share 1.
+    if task.source is not None and any(shares[:d]) and 1 not in shares[:d]:
+        raise BadInput(
+            f"noisy is {task.noisy}, so that --eps is the noise of none of {listed(chart.names)}: divide it "
+            f"by {max(shares[:d]):g}, and give an eps that is {max(shares[:d]):g} times as large"
         )
 
 
