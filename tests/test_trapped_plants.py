@@ -14,7 +14,7 @@ from hyrl_mj.judging.proof.assumptions import check_assumptions
 from hyrl_mj.judging.proof.cells import Cells
 from hyrl_mj.physics import memory
 from hyrl_mj.sets import Grid
-from hyrl_mj.simulation import noise
+from hyrl_mj.simulation import judge_task, noise
 from hyrl_mj.tasks import Outcome, check_task, trial
 from hyrl_mj.tasks.motion import begins_anew, stands_still
 
@@ -262,6 +262,55 @@ def test_a_file_that_registers_what_can_be_registered_once_is_taken(tmp_path, mo
     )
     monkeypatch.setattr(noise, "_KINDS", dict(noise._KINDS))
     trial.try_methods(task_of(vehicle(), tmp_path))
+
+
+def test_a_measurement_in_single_precision_is_taken(tmp_path):
+    single = "\n    def measure(self, sensors):\n        return sensors.astype(np.float32)\n"
+    task = task_of(methods(vehicle(), single), tmp_path)
+    assert task.measure(np.ones((3, 2))).dtype == float
+    assert judge_task(task) == 50
+
+
+GRID = """
+    def starts(self, n, rng):
+        return np.linspace(self.start_low, self.start_high, n)
+"""
+COUNTING = """
+    def miss(self, z):
+        return np.abs(z[:, 1])
+
+    @property
+    def close(self):
+        type(self).count += 1
+        return 0.3
+"""
+OTHER = """
+    @property
+    def model(self):
+        if "_made" not in vars(self):
+            spec = mujoco.MjSpec.from_file(str(self.model_path))
+            spec.body("robot").mass = np.random.default_rng().uniform(1, 2)
+            spec.body("robot").explicitinertial = True
+            spec.body("robot").inertia = np.ones(3)
+            self._made = spec.compile()
+        return self._made
+"""
+
+
+@pytest.mark.parametrize(
+    ("code", "says"),
+    [
+        (GRID, r"starts\(1\) gives x = 0 each time, and starts\(64\) others"),
+        (COUNTING, "methods change count when"),
+        (OTHER, "its model is another one where .* is executed once more"),
+    ],
+)
+def test_starts_properties_and_models_that_are_not_the_same_are_refused(
+    tmp_path, monkeypatch, code, says
+):
+    monkeypatch.setattr(trapped_plants, "TASK", "import mujoco\n" + TASK)
+    with pytest.raises(BadInput, match=says):
+        check_task(task_of(methods(vehicle(), code), tmp_path))
 
 
 BEARING = """

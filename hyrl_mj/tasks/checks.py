@@ -376,6 +376,14 @@ def _check_starts(task: Task) -> None:
         raise BadInput(
             "starts() draws other starts from a generator of the same seed: let it draw from that alone"
         )
+    if type(task).plant is Task.plant:  # a reset may take long
+        rng = np.random.default_rng(5)
+        alone = np.vstack([task.starts(1, rng) for _ in range(STARTS)])
+        if (held := np.flatnonzero((np.ptp(alone, axis=0) == 0) & (np.ptp(z, axis=0) > 0))).size:
+            raise BadInput(
+                f"starts(1) gives {task.chart.names[held[0]]} = {alone[0, held[0]]:.4g} each time, and "
+                f"starts({STARTS}) others, too: draw each start by itself from the generator"
+            )
     outside = z[~task.chart.contains(z)]
     if len(outside):
         point = task.chart.format(outside[0])

@@ -38,10 +38,11 @@ COLUMNS = {
     "danger": "",
     "direction": "",
     "where": "plane",
+    "measure": "noisy",
 }
 
 
-METHODS = (*COLUMNS, "measure", "state", "control", "mocap")
+METHODS = (*COLUMNS, "state", "control", "mocap")
 DEFAULTS = "hyrl_mj.tasks.base"  # the module of those that need no guard
 _GUARDS: WeakSet[Callable[..., Any]] = WeakSet()
 
@@ -132,6 +133,8 @@ def _guarded(name: str, method: Callable[..., Any]) -> Callable[..., Any]:
             ) from error
         if name in COLUMNS:
             _check_result(self, name, args, result)
+            if name == "measure":  # in single precision rewards would be rounded by the batch
+                result = result.astype(float, copy=False)
         elif name == "state":
             _check_state(self, args, result)
         # Part of what was shown is read-only, too, and the caller may write to what it gets.
@@ -164,7 +167,7 @@ def _check_result(task: Task, name: str, args: tuple[Any, ...], result: Any) -> 
             f"{name}() of the task {task.name} gives {result.dtype} from {result.min()} to "
             f"{result.max()}: give a hyrl_mj.Outcome for each row"
         )
-    if name in ("z", "with_z", "observation") and not math.isfinite(result.sum()):
+    if name in ("measure", "z", "with_z", "observation") and not math.isfinite(result.sum()):
         finite = np.isfinite(result).all(axis=1)
         if not finite.all():
             row = int(np.argmin(finite))

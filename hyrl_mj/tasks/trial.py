@@ -108,6 +108,8 @@ def try_methods(task: Task) -> None:
         shared = _copied(_shared(task))
         for asked in methods.values():
             asked(every)
+        for name in vars(Task)["__annotations__"]:  # a property may count
+            getattr(task, name, None)
     _check_unchanged(task, shared, _shared(task))
     if global_state() != chance:
         raise BadInput(
@@ -130,6 +132,11 @@ def _try_again(task: Task) -> None:
                 f"{name} is {now!r:.60}, and {again!r:.60} where {task.source} is executed once more, as "
                 "each process does that opens a run: change it in the file"
             )
+    if task.model is not twin.model and _saved(task.model) != _saved(twin.model):
+        raise BadInput(
+            f"its model is another one where {task.source} is executed once more, as each process does: let "
+            "the code make the same each time"
+        )
     z = task.chart.draw(ANYWHERE, np.random.default_rng(0))
     measured, every = task.placed(z).measurement, np.arange(len(z))
     asked = _methods(twin, z, measured)
@@ -141,6 +148,12 @@ def _try_again(task: Task) -> None:
                 f"{task.source} is executed once more, as each process does: draw nothing there at random, "
                 "and let nothing depend on when it is executed"
             )
+
+
+def _saved(model: mujoco.MjModel) -> bytes:
+    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return buffer.tobytes()
 
 
 def _differing_row(a: np.ndarray, b: np.ndarray) -> int | None:
