@@ -313,6 +313,18 @@ def test_starts_properties_and_models_that_are_not_the_same_are_refused(
         check_task(task_of(methods(vehicle(), code), tmp_path))
 
 
+@pytest.mark.parametrize("other", ["hash('wall') % 1_000 / 1_000", "0.0"])
+def test_what_another_process_computes_otherwise_is_refused(tmp_path, other):
+    robot = vehicle()
+    robot = robot._replace(py=robot.py | {"observation": f"return measured + {other}"})
+    task = task_of(robot, tmp_path)
+    if other == "0.0":
+        trial.try_elsewhere(task)
+        return
+    with pytest.raises(BadInput, match=r"observation\(\) gives .* in another process, where sets"):
+        trial.try_elsewhere(task)
+
+
 BEARING = """
     def measure(self, sensors):
         x, y = sensors.T

@@ -35,6 +35,7 @@ from hyrl_mj.tasks import (
     hidden_goal,
     jumped_over,
     overlooked,
+    try_elsewhere,
 )
 from hyrl_mj.viz import beginning
 
@@ -247,6 +248,7 @@ def _run_all(run: Run, say: Say, stages: Collection[str] = STAGES, learned: bool
     """Runs the stages that are not done; those after the first only if it has `learned`, if that is asked."""
     if not run.manifest.is_done("critical-set"):
         judge_task(run.task)
+        try_elsewhere(run.task)
     if "robustness" in stages and not run.manifest.is_done("robustness"):
         say(f"the run will be examined {examination_plan(run)}")
     s = run.settings

@@ -46,6 +46,7 @@ from hyrl_mj.tasks.registry import (
     task_names,
 )
 from hyrl_mj.tasks.scaffold import write_task
+from hyrl_mj.tasks.trial import try_elsewhere
 
 __all__ = [
     "ANY",
@@ -93,6 +94,7 @@ __all__ = [
     "stands_still",
     "task_names",
     "touching",
+    "try_elsewhere",
     "way_name",
     "wrapped",
     "write_task",

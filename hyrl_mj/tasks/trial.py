@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import copy
 import inspect
+import os
 import pickle
 import random
+import subprocess
 import sys
+import tempfile
 from collections import deque
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
@@ -26,13 +29,14 @@ from hyrl_mj.system.generators import global_state
 from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.description import Outcome
 from hyrl_mj.tasks.guard import check_finite
-from hyrl_mj.tasks.registry import alike, made_again
+from hyrl_mj.tasks.registry import alike, get_task, made_again
 
 # Steps of the physics that the episodes of a trial take together, at most; and the fewest side by side.
 STEPS, FEWEST = 200_000, 16
 STARTS = 32  # as training draws them
 ANYWHERE = 4_000  # places at which a task that is made again has to be the same
 NO_METRES = ("um", "mm", "cm", "dm", "km", "in", "ft", "rad", "deg", "°")
+LONGEST = 60  # that another process takes [s]
 MOST_HELD = 1_000  # entries of a list or the like that are looked at one by one
 # Samples after which an input must have changed something.
 EFFECT = 10
@@ -137,17 +141,56 @@ def _try_again(task: Task) -> None:
             f"its model is another one where {task.source} is executed once more, as each process does: let "
             "the code make the same each time"
         )
-    z = task.chart.draw(ANYWHERE, np.random.default_rng(0))
-    measured, every = task.placed(z).measurement, np.arange(len(z))
-    asked = _methods(twin, z, measured)
-    for name, of_rows in _methods(task, z, measured).items():
-        here, there = of_rows(every), asked[name](every)
-        if (row := _differing_row(here, there)) is not None:
+    (z, here), (_, there) = _answers(task), _answers(twin)
+    for name in here:
+        if (row := _differing_row(here[name], there[name])) is not None:
             raise BadInput(
-                f"{name}() gives {here[row]} at {task.chart.format(z[row])}, and {there[row]} where "
-                f"{task.source} is executed once more, as each process does: draw nothing there at random, "
-                "and let nothing depend on when it is executed"
+                f"{name}() gives {here[name][row]} at {task.chart.format(z[row])}, and {there[name][row]} "
+                f"where {task.source} is executed once more, as each process does: draw nothing there at "
+                "random, and let nothing depend on when it is executed"
             )
+
+
+def try_elsewhere(task: Task) -> None:
+    """Raises `BadInput` if a method of a file's task differs in another process, as by the order of a set.
+
+    Texts are hashed otherwise there. What can be imported in this process alone is not tried.
+    """
+    if made_again(task) is None:
+        return
+    seed = "1" if os.environ.get("PYTHONHASHSEED") != "1" else "2"
+    places = os.pathsep.join(filter(None, sys.path))
+    program = "import sys; from hyrl_mj.tasks import trial; trial.write_answers(*sys.argv[1:])"
+    with tempfile.TemporaryDirectory() as folder:
+        answers = f"{folder}/answers.npz"
+        command = [sys.executable, "-c", program, str(task.source), answers]
+        own = os.environ | {"PYTHONHASHSEED": seed, "PYTHONPATH": places}
+        with suppress(subprocess.TimeoutExpired):
+            subprocess.run(command, env=own, capture_output=True, timeout=LONGEST, check=False)
+        if not os.path.exists(answers):
+            return
+        with np.load(answers, allow_pickle=False) as file:
+            there = dict(file)
+    z, here = _answers(task)
+    for name in here.keys() & there.keys():
+        if (row := _differing_row(here[name], there[name])) is not None:
+            raise BadInput(
+                f"{name}() gives {here[name][row]} at {task.chart.format(z[row])}, and {there[name][row]} in "
+                "another process, where sets of texts are in another order: let nothing depend on that, on "
+                "hash() or on the process"
+            )
+
+
+def write_answers(source: str, path: str) -> None:
+    """Writes what the methods of a file's task give all over its chart to an npz file."""
+    np.savez(path, **_answers(get_task(source))[1])
+
+
+def _answers(task: Task) -> tuple[np.ndarray, dict[str, Any]]:
+    """Returns chart points (n, d), and what the methods give for them (n, ...), by name."""
+    z = task.chart.draw(ANYWHERE, np.random.default_rng(0))
+    every, methods = np.arange(len(z)), _methods(task, z, task.placed(z).measurement)
+    return z, {name: of_rows(every) for name, of_rows in methods.items()}
 
 
 def _saved(model: mujoco.MjModel) -> bytes:
