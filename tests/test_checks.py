@@ -251,6 +251,19 @@ def test_an_error_that_no_single_row_raises_has_no_state(tmp_path):
         task.reward(np.zeros((2, 4)), np.zeros((2, 1)))
 
 
+def test_a_subclass_may_add_columns_to_those_of_its_base(vehicle):
+    class More(type(vehicle)):
+        observation_low, observation_high = (
+            (*vehicle.observation_low, -9),
+            (*vehicle.observation_high, 9),
+        )
+
+        def observation(self, measured):
+            return np.hstack([super().observation(measured), measured[:, :1]])
+
+    assert More().observation(np.zeros((3, 2))).shape == (3, 4)
+
+
 def test_a_method_that_works_returns_what_it_did(vehicle):
     z = np.array([[0.1, 0.2], [0.3, 0.4]])
     np.testing.assert_array_equal(vehicle.ending(z), [Outcome.RUNNING] * 2)
