@@ -199,7 +199,6 @@ SWAPPED = (XML, r'name="x"(.*)"1 0 0"/>\n(.*)"0 1 0"', r'name="x"\1"0 1 0"/>\n\2
     "edit",
     [
         SWAPPED,
-        (PYTHON, "max_steps = 70", "max_steps = 70\n    plane = (1, 0)"),
         (PYTHON, "max_steps = 70", "max_steps = 70\n    plane = (0, 2)"),
     ],
 )

@@ -248,7 +248,7 @@ def test_a_mistake_is_one_sentence(mistake):
 
 
 def test_what_is_right_is_taken():
-    for task in (Field(WIDE), Field(ROW), looking(lambda m: m[:, ::-1], plane=(1, 0))):
+    for task in (Field(WIDE), Field(ROW), looking(lambda m: m + 0)):
         assert check_task(task) is task
     rail = Rail(WIDE)
     type(rail).where = lambda self, measured: measured
