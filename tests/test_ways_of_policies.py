@@ -250,10 +250,9 @@ def test_a_mistake_is_one_sentence(mistake):
 def test_what_is_right_is_taken():
     for task in (Field(WIDE), Field(ROW), looking(lambda m: m + 0)):
         assert check_task(task) is task
-    rail = Rail(WIDE)
-    type(rail).where = lambda self, measured: measured
+    rail = type("Placed", (Rail,), {"where": lambda self, measured: measured})(WIDE)
     assert check_task(rail) is rail, "x is 0 at each start, and grows"
-    del type(rail).where
-    type(rail).direction = lambda self, path: np.where(path[-1, :, 0] > 0, 0, 1)
+    way = {"direction": lambda self, path: np.where(path[-1, :, 0] > 0, 0, 1)}
+    rail = type("Directed", (Rail,), way)(WIDE)
     rail.scene = replace(rail.scene, mode_names=("left", "right"))
     assert check_task(rail) is rail
