@@ -6,10 +6,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from environments import Puck, puck_agent
-from planted import circle_policy, one_way_policy, sign_policy
+from planted import ChartPolicy, circle_policy, one_way_policy, pass_on, sign_policy
 
 from hyrl_mj import BadInput, extend, find_critical_set, from_gymnasium, make_partition
+from hyrl_mj.learning.presets import preset
+from hyrl_mj.pipeline.steps import extended_sets_stage
 from hyrl_mj.sets import distance_to
+from hyrl_mj.stages import ExtendedSets, Partition
 
 PI = np.pi
 # From the axis an obstacle of radius 0.75 at x = 1.5 can be passed only if x <= this.
@@ -276,3 +279,35 @@ def test_sets_reach_walls_that_only_stop_the_robot_and_hold_their_inside(few_tri
         assert len(gained)
         from_walls = np.linalg.norm(nodes[walls][:, None] - gained, axis=2).min(axis=0)
         assert from_walls.max() < noise * np.sqrt(2) + 2 * partition.grid.cell
+
+
+@pytest.mark.slow
+def test_a_late_decision_of_a_robot_with_inertia_is_taken_from_its_policy(puck, tmp_path):
+    """It goes right from wherever that just succeeds; held inputs show that left has room there."""
+
+    def late(z):
+        side = np.where(z[:, 1] < 0.5 - 0.9 * z[:, 0], -1.0, 1.0)
+        return pass_on(np.where(z[:, 0] < 1.1, side, np.sign(z[:, 1])), z[:, 1], 0.9)
+
+    policy, eps = ChartPolicy(puck, late), 0.1
+    x = np.linspace(0.0, 0.9, 30)
+    points = np.column_stack([x, 0.5 - 0.9 * x])
+    settings = replace(preset(puck, "fast"), eps=eps, cells=60)
+    partition = make_partition(puck, policy, points, 60, eps, settings.ways)
+    run = SimpleNamespace(
+        settings=settings, task=puck, steady=policy, agent=None, path=tmp_path,
+        critical_set=SimpleNamespace(points=points), partition=partition,
+    )  # fmt: skip
+    extended_sets_stage(run, str)
+    split = Partition.load(tmp_path / "split.npz", puck)
+    assert split.parts[0].contains(np.array([[0.0, 0.45], [0.3, 0.2]])).all()
+    usual = extend(puck, policy, points, partition, eps)
+    before = partition.grid.nodes[:, 0] < 0.7
+    doomed = [
+        sum(
+            (own.mask & ~wins & before).sum()
+            for own, wins in zip(s.sets, usual.winning, strict=True)
+        )
+        for s in (usual, ExtendedSets.load(tmp_path / "extended_sets.npz", puck))
+    ]
+    assert doomed[1] < 0.85 * doomed[0], "from fewer states of the sets their modes lose"

@@ -31,7 +31,7 @@ from hyrl_mj.pipeline.steps import STAGES
 from hyrl_mj.policies.external import read_agent, reopen_agent
 from hyrl_mj.runs.arcs import noisy_arcs
 from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.stages import Partition, boundary, with_room
+from hyrl_mj.stages import Partition, boundary, open_ways, with_room
 from hyrl_mj.stages.grounds import ByGame, Judged, mode_ground
 from hyrl_mj.stages.retraining import retrain, start_policy
 
@@ -355,7 +355,8 @@ def test_a_late_decision_is_taken_from_the_agent(vehicle):
     left = y > np.maximum(0.4 - x, 0)
     parts = tuple(GridSet.from_mask(grid, part | joined) for part in (left, ~left))
     partition = Partition((0, 1), parts, np.ones(len(x), dtype=bool))
-    ways = Limit.solve(Lattice.tabulate(vehicle, Grid.with_cells(vehicle.chart, 240)), partition)
+    limit = Limit.solve(Lattice.tabulate(vehicle, Grid.with_cells(vehicle.chart, 240)), partition)
+    ways = open_ways(limit, grid)
     policy = hyrl_mj.from_callable(lambda o: np.where(o[:, 2] > 0, 0, 4), vehicle)
     found = with_room(vehicle, policy, partition, ways, 0.1)
     points = np.array([[0.0, 0.35], [0.1, 0.2], [0.0, -0.2], [0.0, 0.6], [0.3, 0.05]])
@@ -370,6 +371,8 @@ def test_a_late_decision_is_taken_from_the_agent(vehicle):
     early = (x < 0.2) & (np.abs(y) > 0.03)
     for old, new in zip(fair.parts, kept.parts, strict=True):
         np.testing.assert_array_equal(old.mask[early], new.mask[early])
+    everywhere = (np.ones(len(x), dtype=bool),) * 2
+    assert with_room(vehicle, policy, partition, everywhere, 0.1) is partition
 
 
 # ---- mistakes

@@ -39,7 +39,9 @@ from hyrl_mj.stages import (
     boundary,
     extend,
     find_critical_set,
+    held_inputs,
     make_partition,
+    open_ways,
     part_policies,
     with_room,
 )
@@ -134,17 +136,22 @@ def partition_stage(run: Run, say: Say) -> None:
 
 def extended_sets_stage(run: Run, say: Say) -> None:
     """Stages 4 and 5: extends the parts over the critical set."""
-    s, task = run.settings, run.task
+    s, task, policy = run.settings, run.task, run.steady
     points, split, ways = run.critical_set.points, run.partition, None
-    if run.agent:
-        if not Lattice.why_not(task) and Lattice.decides(task, run.lattice_grid):
-            lattice = Lattice.tabulate(task, run.lattice_grid)
-            ways = Limit.solve(lattice, split)
-            split = with_room(task, run.steady, split, ways, s.eps)
-            ways = Limit.solve(lattice, split)
+    if run.agent and not Lattice.why_not(task) and Lattice.decides(task, run.lattice_grid):
+        lattice = Lattice.tabulate(task, run.lattice_grid)
+        limit = Limit.solve(lattice, split)
+        split = with_room(task, policy, split, open_ways(limit, split.grid), s.eps)
+        ways = open_ways(Limit.solve(lattice, split), split.grid)
+        points = boundary(split)
+    sets = extend(task, policy, points, split, s.eps, s.horizon, ways, s.overlap)
+    if held_inputs(task, split.grid) is not None:  # which have shown from where each way is open
+        split = with_room(task, policy, split, sets.winning, s.eps)
+        if split is not run.partition:
             points = boundary(split)
+            sets = extend(task, policy, points, split, s.eps, s.horizon, sets.winning, s.overlap)
+    if run.agent or split is not run.partition:
         split.save(run.path / "split.npz")
-    sets = extend(task, run.steady, points, split, s.eps, s.horizon, ways, s.overlap)
     sets.save(run.path / "extended_sets.npz")
     say(sets.sentence(task))
 

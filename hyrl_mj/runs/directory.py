@@ -213,10 +213,11 @@ class Run:
 
     @cached_property
     def split(self) -> Partition:
-        """The parts that stage 5 extends: M_i, for an agent changed where they leave no room."""
-        if self.agent is None:
+        """The parts that stage 5 extends: M_i, changed where they leave no room though there is some."""
+        path = self.path / "split.npz"
+        if self.agent is None and not self.manifest.has(path):
             return self.partition
-        return Partition.load(self._checked("split.npz"), self.task)
+        return Partition.load(self._checked(path.name), self.task)
 
     @cached_property
     def extended_sets(self) -> ExtendedSets:

@@ -6,12 +6,13 @@ Stage 2 is `find_critical_set`, stage 3 `make_partition`, stages 4 and 5 `extend
 """
 
 from hyrl_mj.stages.critical_set import CriticalSet, critical_points, find_critical_set
-from hyrl_mj.stages.extended_sets import ExtendedSets, extend
+from hyrl_mj.stages.extended_sets import ExtendedSets, extend, held_inputs
 from hyrl_mj.stages.partition import (
     Partition,
     PartPolicy,
     boundary,
     make_partition,
+    open_ways,
     part_policies,
     with_room,
 )
@@ -29,7 +30,9 @@ __all__ = [
     "extend",
     "find_critical_set",
     "grounds",
+    "held_inputs",
     "make_partition",
+    "open_ways",
     "part_policies",
     "retraining",
     "table_for",

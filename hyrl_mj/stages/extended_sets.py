@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache, partial
 from itertools import product
@@ -12,10 +12,10 @@ import numpy as np
 
 from hyrl_mj.errors import BadInput, counted
 from hyrl_mj.files.artifacts import Saved
-from hyrl_mj.judging.game import Lattice, Limit, nearest_of
+from hyrl_mj.judging.game import Lattice, nearest_of
 from hyrl_mj.learning import OverlapSettings
 from hyrl_mj.policies import Policy
-from hyrl_mj.sets import Cloud, Grid, GridSet, check_points, distance_to
+from hyrl_mj.sets import Cloud, Grid, GridSet, Nodes, check_points, distance_to
 from hyrl_mj.simulation import Rollout, policy_runs
 from hyrl_mj.stages.meeting import least_room, where
 from hyrl_mj.stages.partition import (
@@ -24,7 +24,6 @@ from hyrl_mj.stages.partition import (
     check_sets,
     longest_hop,
     neighbourhood,
-    open_ways,
 )
 from hyrl_mj.stages.refinement import refined
 from hyrl_mj.tasks import Outcome, Task, stands_still
@@ -123,7 +122,7 @@ def extend(
     partition: Partition,
     eps: float,
     horizon: float | None = None,
-    ways: Limit | None = None,
+    ways: Sequence[np.ndarray] | None = None,
     settings: OverlapSettings = OverlapSettings(),
 ) -> ExtendedSets:
     """Extends the parts over M* (paper, Steps 4 and 5).
@@ -147,9 +146,10 @@ def extend(
         eps: bound of the measurement noise.
         horizon: time T of the backward propagation [s]. By default, the shortest with which every set
             reaches 2 eps and one sample over M* wherever its mode succeeds; the sets end there.
-        ways: from where each way is open, for an agent. Beyond its decision an agent may be unable to go
-            the other way, but stage 6 trains the mode to do so: W_i is then where way i is open. Without a
-            horizon, every set reaches 2 eps and one sample over the boundary of its part.
+        ways: (N,) bool over the nodes for each mode, from where its way is known to be open. Beyond its
+            decision a policy may be unable to go the other way, but stage 6 trains the mode to do so: W_i is
+            then where way i is open. Without a horizon, every set reaches 2 eps and one sample over the
+            boundary of its part.
         settings: when a horizon is long enough, and what is a gap.
     """
     points = check_points(task.chart, points, task.name)
@@ -168,7 +168,7 @@ def extend(
     # The cells that backward runs visit are those of a grid.
     backward = task.kinematic and isinstance(grid, Grid) and stands_still(task)
     longest = round(settings.longest / task.dt)
-    held = None if ways is not None or Lattice.decides(task, grid) else held_inputs(task)
+    held = None if ways is not None else held_inputs(task, grid)
 
     @cache
     def told(i: int) -> np.ndarray:
@@ -182,7 +182,7 @@ def extend(
     winning = (
         tuple((partition.succeeds & p.mask) | (told(i)[:, 0] > 0) for i, p in enumerate(parts))
         if ways is None
-        else open_ways(ways, grid)
+        else tuple(ways)
     )
     # W_i with room for the noise. Noise that shows the robot in a wall that only stops it does not show it
     # where its mode fails.
@@ -325,12 +325,13 @@ class _Entering:
         return u
 
 
-def held_inputs(task: Task) -> np.ndarray | None:
-    """Returns the inputs (A, m) that show what a mode can do; None where samples take too long to try them.
+def held_inputs(task: Task, grid: Nodes) -> np.ndarray | None:
+    """Returns the inputs (A, m) that show what a mode can do at the nodes of a grid.
 
-    They are the levels of a task, or the ends and the middle of the limits of each input.
+    They are the levels of a task, or the ends and the middle of the limits of each input. There are none
+    where the worst-case game decides, or samples take too long to try them.
     """
-    if task.effort.attacked:
+    if task.effort.attacked or Lattice.decides(task, grid):
         return None
     if task.input_levels is not None:
         return np.asarray(task.input_levels)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
@@ -228,20 +228,20 @@ def _across(task: Task, nodes: np.ndarray, points: np.ndarray, reach: float) -> 
 
 
 def with_room(
-    task: Task, policy: Policy, partition: Partition, limit: Limit, eps: float
+    task: Task, policy: Policy, partition: Partition, ways: Sequence[np.ndarray], eps: float
 ) -> Partition:
     """Returns the parts, changed where the policy goes a way that is about to close while another is not.
 
-    An agent that drives towards the middle of an obstacle and decides at the last moment leaves no room for
-    an overlap. A state with less room for its way than 2 eps and one sample is therefore assigned to the
-    mode whose way has the most room. Where every way has that room, or none has any, the decision of the
-    policy stands.
+    A policy that drives towards the middle of an obstacle and decides at the last moment, or goes one way
+    from wherever it just succeeds, leaves no room for an overlap. A state with less room for its way than
+    2 eps and one sample is therefore assigned to the mode whose way has the most room. Where every way has
+    that room, or none has any, the decision of the policy stands.
 
     Args:
         task: gives the noisy coordinates.
-        policy: the agent.
+        policy: the stage-1 policy, or the agent.
         partition: M_i, by the way that the policy goes.
-        limit: from where each way is open.
+        ways: (N,) bool over the nodes for each mode, from where its way is open.
         eps: bound of the measurement noise.
     """
     grid = partition.grid
@@ -249,11 +249,13 @@ def with_room(
         return partition
     hop = longest_hop(task, policy, grid) * (task.noise_in_chart(1.0) > 0)
     wanted = float((2 * task.noise_in_chart(eps) + hop).max())
-    room = -np.stack([GridSet.from_mask(grid, open_).values for open_ in open_ways(limit, grid)])
+    room = -np.stack([GridSet.from_mask(grid, open_).values for open_ in ways])
     masks = np.stack([part.mask for part in partition.parts])
     own = np.where(masks, room, -np.inf).max(axis=0)
     best = room.argmax(axis=0)
     moved = (masks.sum(axis=0) == 1) & (own < wanted) & (room.max(axis=0) > np.maximum(own, 0))
+    if not moved.any():
+        return partition
     parts = tuple(
         GridSet.from_mask(grid, np.where(moved, best == i, mask)) for i, mask in enumerate(masks)
     )
