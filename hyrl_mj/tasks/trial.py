@@ -163,7 +163,7 @@ def try_elsewhere(task: Task) -> None:
     program = "import sys; from hyrl_mj.tasks import trial; trial.write_answers(*sys.argv[1:])"
     with tempfile.TemporaryDirectory() as folder:
         answers = f"{folder}/answers.npz"
-        command = [sys.executable, "-c", program, str(task.source), answers]
+        command = [sys.executable, "-P", "-c", program, str(task.source), answers]
         own = os.environ | {"PYTHONHASHSEED": seed, "PYTHONPATH": places}
         with suppress(subprocess.TimeoutExpired):
             subprocess.run(command, env=own, capture_output=True, timeout=LONGEST, check=False)
