@@ -19,7 +19,6 @@ from hyrl_mj.viz.figures.charts import INNER, OUTER
 from hyrl_mj.viz.figures.runs import CORE, View
 from hyrl_mj.viz.figures.shown import ShownPolicy
 from hyrl_mj.viz.section import Section
-from hyrl_mj.viz.tables import NAMED
 
 # Cells along the longest side of a map of inputs.
 MAP = 240
@@ -42,9 +41,7 @@ def draw_overview(shown: ShownPolicy) -> Figure:
         panel = figure.subplots()
         panel.set_title(style.noise_label(task, arc.noise, arc.bound))
         for i, mode in enumerate(shown.partition.modes):
-            part = f"only in the part {style.set_label(mode)}"
-            if len(shown.partition.modes) > NAMED:  # names are said here, once
-                part = f"only in {style.set_label(mode)}, of mode {task.mode_name(mode)}"
+            part = f"only in {style.set_label(mode)}, of mode {task.mode_name(mode)}"
             charts.legend_field(panel, part, style.mode_tint(i))
         if charts.is_ring(task.chart):
             _spirals(panel, shown)
@@ -69,7 +66,7 @@ def _field(panel: Axes, shown: ShownPolicy) -> None:
     ahead = arc.z[-1] - arc.z[0]
     triangle = (3, 0, float(np.degrees(np.arctan2(ahead[1], ahead[0]))) - 90)
     looks = {"markersize": 13, "markerfacecolor": PALE, "markeredgecolor": INK}
-    runs.mark(panel, view, arc, 0, triangle, label="robot at its start", **looks)
+    runs.mark(panel, view, arc, 0, triangle, **looks)
     charts.dots(panel, shown.critical.points)
 
 
@@ -114,9 +111,10 @@ def _spirals(panel: Axes, shown: ShownPolicy) -> None:
 def _noiseless_runs(panel: Axes, shown: ShownPolicy, view: View) -> None:
     """Draws the runs without noise, with an arrowhead after a seventh of their samples."""
     looks = {"linewidth": 1.3, "zorder": 3}
-    brief = len(shown.partition.modes) > NAMED
     for arc in shown.noiseless:
-        drawn = runs.chosen_way(panel, shown, view, arc, "without noise: ", brief, **looks)
+        drawn = runs.chosen_way(
+            panel, shown, view, arc, "without noise, coloured by its way", **looks
+        )
         row = len(arc.t) // 7
         points = view.points(arc.t[row : row + 2], arc.z[row : row + 2])
         if len(points) < 2 or (np.abs(points[1] - points[0]) > view.longest).any():
@@ -131,10 +129,10 @@ def _noisy_run(panel: Axes, shown: ShownPolicy, view: View) -> None:
     task, arc = shown.task, shown.noisy
     looks = {"color": POLICY, "linewidth": 1.4, "zorder": 4}
     runs.line(panel, view, arc.t, arc.z, label=f"{shown.policy_title}, with noise", **looks)
-    charts.legend_field(panel, "what it can observe", OBSERVED, OBSERVED)
+    charts.legend_field(panel, "what it can observe, and does (dots)", OBSERVED, OBSERVED)
     looks = {"linestyle": "none", "marker": ".", "color": BAD, "markersize": 4, "zorder": 4.5}
     measured = task.z(arc.measured[:-1])
-    runs.line(panel, view, arc.t[:-1], measured, label="what it observes", **looks)
+    runs.line(panel, view, arc.t[:-1], measured, **looks)
     runs.end(panel, task, view, arc)
 
 

@@ -101,14 +101,10 @@ def chosen_way(
     shown: ShownPolicy,
     view: View,
     arc: HybridArc,
-    prefix: str = "",
-    brief: bool = False,
+    same: str = "",
     **looks: Any,
 ) -> Line2D:
-    """Draws a policy's run in the colour of the mode whose way it goes.
-
-    The label begins with `prefix`; a `brief` one leaves the name of the mode out.
-    """
+    """Draws a policy's run in the colour of the mode whose way it goes; `same` labels all such runs."""
     task, modes = shown.task, shown.partition.modes
     going = modes_of(task, modes, int(task.direction(arc.z[:, None])[0]))
     if arc.outcome != "reached":
@@ -116,10 +112,10 @@ def chosen_way(
     elif len(going) == 1:
         mode = going[0]
         colour = mode_colour(modes.index(mode))
-        label = f"way of mode {mode if brief else task.mode_name(mode)}"
+        label = same or f"way of mode {task.mode_name(mode)}"
     else:
         colour, label = PALE, "nothing to decide" if going else "way of no mode"
-    return line(panel, view, arc.t, arc.z, color=colour, label=prefix + label, **looks)
+    return line(panel, view, arc.t, arc.z, color=colour, label=label, **looks)
 
 
 def modes_of(task: Task, modes: Sequence[int], way: int) -> list[int]:
