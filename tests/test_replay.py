@@ -457,3 +457,9 @@ def test_without_a_video_there_is_no_poster(tmp_path, show, monkeypatch):
     with pytest.raises(NoRenderer, match="reinstall the encoder"):
         render_replay(TASK, [show], tmp_path / "replay.mp4", ReplayOptions(size=SIZE, fps=FPS))
     assert not list(tmp_path.iterdir())
+
+
+def test_nothing_to_replay(tmp_path, crash):
+    for shows in ([], [Show([], [crash])]):
+        with pytest.raises(BadInput, match="give shows with arcs of the policy"):
+            render_replay(TASK, shows, tmp_path / "replay.mp4")

@@ -189,9 +189,8 @@ def check_use(spec: EnvironmentSpec) -> None:
     inner, offset, given = noisy.inner, np.zeros(spec.dimension), list[np.ndarray]()
     own = getattr(inner, "__dict__", dict.fromkeys(spec.observers))
     names = [name for name in spec.observers if hasattr(type(inner), name) and name not in own]
-    if (
-        not names
-    ):  # it is made of several methods, or put in already, or the environment allows no attributes
+    # It may be made of several methods, or put in already, or the environment allows no attributes.
+    if not names:
         return
 
     def observe() -> Any:

@@ -31,7 +31,7 @@ def render_replay(
 
     Args:
         task: the task of the arcs; its `scene` names the site whose path is drawn.
-        shows: the arcs to play, in each show at least one of the policy.
+        shows: the arcs to play.
         path: of the video, an mp4 or a gif, with the poster as a PNG of the same name; or of a PNG for
             the poster alone. The poster shows the end of the first show.
         options: how the replay is rendered.
@@ -39,11 +39,13 @@ def render_replay(
 
     Raises:
         BadArtifact: an arc is not of this task or its model.
-        BadInput: a value that cannot be used.
+        BadInput: nothing to play, or a value that cannot be used.
         NoRenderer: there is no GL library or no video encoder.
     """
     check_replay(task, path, options)
     camera = options.camera or task.scene.camera
+    if not shows or not all(show.policy for show in shows):
+        raise BadInput("there is nothing to replay: give shows with arcs of the policy")
     screens = [Screen(task, show, options, camera, floor) for show in shows]
     poster = screens[0].poster()
     if path.suffix in ENCODERS:
