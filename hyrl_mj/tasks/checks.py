@@ -166,7 +166,6 @@ def hidden_goal(task: Task, eps: float, everywhere: bool = False) -> str:
         return ""
     chart, rng = task.chart, np.random.default_rng(0)
     noise = task.noise_in_chart(1.0, everywhere)
-    hop = task.moves[: chart.dimension] * (noise > 0)
     box = rng.uniform(-1, 1, (OVERLAPS, chart.dimension))
     box[::2] = np.sign(box[::2])  # its corners, too
     goal = task.set_point
@@ -176,20 +175,26 @@ def hidden_goal(task: Task, eps: float, everywhere: bool = False) -> str:
             goal = z[task.miss(z).argmin()]
             z = np.vstack([goal, goal + share * chart.sides * box])
 
-    def farthest(bound: float, hops: int) -> float:
-        z = chart.wrap(goal + (bound * noise + hops * hop) * box)
+    plant = task.plant(len(box))
+    u = np.where(rng.random((len(box), len(task.inputs))) < 0.5, *task.input_limits)
+
+    def farthest(bound: float, moves: bool = True) -> float:
+        z = chart.wrap(goal + bound * noise * box)
+        if moves:  # from rest, as a robot that was there
+            plant.set_state(*task.state(z))
+            plant.step(u)
+            z = task.z(plant.measurement)
         return float(task.miss(z).max())
 
-    if farthest(eps, 1) <= task.close:
+    if (most := farthest(eps)) <= task.close:
         return ""
-    bounds = np.linspace(0, eps, 101)
-    kept = [bound for bound in bounds if farthest(bound, 1) <= task.close]
+    kept = [bound for bound in np.linspace(0, eps, 101) if farthest(bound) <= task.close]
     less = f", or noise of at most {_rounded(max(kept), np.floor):g}" if kept else ""
     return (
         f"{task.name} has arrived up to {task.close:g} from its set-point (close), and noise of {eps:g} "
-        f"alone hides up to {farthest(eps, 0):.3g} of that, and {farthest(eps, 1):.3g} with what it moves in "
+        f"alone hides up to {farthest(eps, False):.3g} of that, and {most:.3g} with what it moves in "
         "one sample: there it may be lost whatever way it has gone. Give it a close of at least "
-        f"{_rounded(farthest(eps, 1), np.ceil):g}{less}"
+        f"{_rounded(most, np.ceil):g}{less}"
     )
 
 

@@ -117,7 +117,7 @@ class Lattice(Places):
         if not task.chart_is_state:
             return (
                 "the exact worst case needs a plant whose whole state is the chart, and "
-                f"{task.name} has a larger state"
+                f"{task.name} has a larger state, or inertia"
             )
         if grid is None:
             return None
