@@ -213,9 +213,9 @@ def test_a_set_point_that_noise_hides_is_told_with_what_would_do(circle):
 
 def test_a_robot_with_inertia_moves_from_rest_at_its_set_point(puck):
     """Elsewhere it moves by up to 0.05 m in a sample."""
-    Slow = type("Slow", (type(puck),), {"close": 0.13, "ending": at_no_end})
+    slow = type("Slow", (type(puck),), {"close": 0.13, "ending": at_no_end})
     assert puck.moves[1] > 0.045
-    assert not hidden_goal(Slow(), 0.1)
+    assert not hidden_goal(slow(), 0.1)
 
 
 def at_no_end(self, measured):
