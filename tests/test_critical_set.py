@@ -16,6 +16,7 @@ from planted import (
 )
 
 from hyrl_mj import BadInput, CriticalSet, find_critical_set
+from hyrl_mj.stages.meeting import ranges
 from hyrl_mj.tasks import SEARCHES
 
 PI = np.pi
@@ -66,6 +67,12 @@ def test_two_critical_angles_are_two_pieces(search, circle):
     angles = sorted(critical.points[critical.component == k].mean() for k in range(2))
     assert angles == pytest.approx([2.0, 4.0], abs=critical.resolution)
     assert critical.sentence(circle).startswith("critical set of 2 pieces")
+
+
+def test_the_range_of_an_angle_goes_the_short_way_round(circle):
+    assert ranges(circle.chart, np.array([[6.2], [0.1], [0.0]]), 1e-3) == "theta 6.2 to 6.383 rad"
+    everywhere = np.linspace(0, 6.2, 40)[:, None]
+    assert ranges(circle.chart, everywhere, 1e-3) == "theta 0 to 6.2 rad"
 
 
 def test_a_continuous_policy_has_one_too(search, circle):

@@ -123,7 +123,17 @@ def where(chart: Chart, points: np.ndarray, narrow: np.ndarray) -> str:
 
 
 def ranges(chart: Chart, points: np.ndarray, resolution: float) -> str:
-    """Returns the range of points (N, d) along each coordinate: "x 0 to 0.45 m, y 0.1 m"."""
+    """Returns the range of points (N, d) along each coordinate: "x 0 to 0.45 m, y 0.1 m".
+
+    That of a periodic coordinate is the shortest one: it may end beyond the chart.
+    """
+    points = points.copy()
+    for i in np.flatnonzero(chart.periodic):
+        turn, ends = chart.sides[i], np.sort(points[:, i])
+        gaps = np.diff(ends, append=ends[0] + turn)
+        if gaps.max() > gaps[-1] + resolution:
+            begin = ends[gaps.argmax() + 1]
+            points[:, i] = begin + (points[:, i] - begin) % turn
     ends = zip(chart.names, chart.units, points.min(axis=0), points.max(axis=0), strict=True)
     fine = resolution / 100 or 1e-12  # what is hardly off 0 is 0
     return ", ".join(
