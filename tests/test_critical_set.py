@@ -71,8 +71,8 @@ def test_two_critical_angles_are_two_pieces(search, circle):
 
 def test_the_range_of_an_angle_goes_the_short_way_round(circle):
     assert ranges(circle.chart, np.array([[6.2], [0.1], [0.0]]), 1e-3) == "theta 6.2 to 6.383 rad"
-    everywhere = np.linspace(0, 6.2, 40)[:, None]
-    assert ranges(circle.chart, everywhere, 1e-3) == "theta 0 to 6.2 rad"
+    everywhere = np.linspace(0, 2 * PI, 40, endpoint=False)[:, None]
+    assert ranges(circle.chart, everywhere, 1e-3) == "theta 0 to 6.126 rad"
 
 
 def test_a_continuous_policy_has_one_too(search, circle):
