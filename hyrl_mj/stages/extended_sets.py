@@ -275,8 +275,8 @@ def runs_from_outside(
     for.
 
     pi_i says little of what a mode can do from where the stage-1 policy goes the other way. Where its run
-    fails, each of the `held` inputs (A, m) is held until the robot is in M_i, and pi_i goes on from there: a
-    run that arrives shows that a mode can.
+    fails, each of the `held` inputs (A, m) is held until the robot is in M_i, a cell from its boundary, and
+    the stage-1 policy goes on from there: a run that arrives shows that a mode can.
     """
     arrives = partition.succeeds & part.mask
     entry = np.full(len(rows), np.inf)
@@ -292,13 +292,14 @@ def runs_from_outside(
             wins[outside] &= ~_astray(partition, part, arrives, rows[outside], rollout)
         if rim is not None:
             entry[outside] = _entries(part, rim, rollout, longest)
+    inside = part.eroded(part.grid.cell)
     for u in () if held is None else held:
         lost = outside[~wins[outside]]
         if not len(lost):
             break
         starts = part.grid.nodes[rows[lost]]
         rollout = policy_runs(
-            task, _Entering(pi, part, u), starts, label="extended sets, held inputs"
+            task, _Entering(pi, inside, u), starts, label="extended sets, held inputs"
         )
         won = rollout.outcome == Outcome.REACHED
         won &= ~_astray(partition, part, arrives, rows[lost], rollout)
@@ -310,18 +311,21 @@ def runs_from_outside(
 
 @dataclass(frozen=True)
 class _Entering:
-    """Holds inputs u (m,) until the robot is in M_i, where pi_i goes on."""
+    """Holds inputs u (m,) until the robot is `inside` M_i, where the stage-1 policy goes on its way.
+
+    pi_i would go on as at the nearest point at which that policy has decided, which with inertia may be far.
+    """
 
     pi: PartPolicy
-    part: GridSet
+    inside: GridSet
     u: np.ndarray
 
     def act(self, measured: np.ndarray) -> np.ndarray:
         """Returns inputs (n, m) for measurements (n, p)."""
-        inside = self.part.contains(self.pi.task.z(measured))
+        inside = self.inside.contains(self.pi.task.z(measured))
         u = np.tile(self.u, (len(measured), 1)).astype(float)
         if inside.any():
-            u[inside] = self.pi.act(measured[inside])
+            u[inside] = self.pi.policy.act(measured[inside])
         return u
 
 
