@@ -13,6 +13,8 @@ from hyrl_mj.learning.presets import preset
 from hyrl_mj.pipeline.steps import extended_sets_stage
 from hyrl_mj.sets import distance_to
 from hyrl_mj.stages import ExtendedSets, Partition
+from hyrl_mj.stages.extended_sets import _Entering
+from hyrl_mj.stages.partition import PartPolicy
 
 PI = np.pi
 # From the axis an obstacle of radius 0.75 at x = 1.5 can be passed only if x <= this.
@@ -53,6 +55,16 @@ def overlap(sets, x):
     z = np.stack([np.full_like(y, x), y], axis=-1)
     left, right = (y[s.contains(z)] for s in sets.sets)
     return (right.max() - left.min()) / 2
+
+
+def test_what_has_entered_its_part_goes_on_as_the_stage_1_policy(vehicle):
+    """pi_i would go on as at the nearest point inside of M_i, which with inertia may be far."""
+    policy = ChartPolicy(vehicle, lambda z: z[:, 1:])
+    left = make_partition(vehicle, sign_policy(vehicle), np.zeros((1, 2)), 60).parts[0]
+    pi, near = PartPolicy(vehicle, policy, left.eroded(0.5), 0.5), left.eroded(left.grid.cell)
+    z = np.array([[1.0, -0.3], [1.0, 0.01], [1.0, 0.3], [1.0, 0.9]])
+    assert pi.act(z)[2, 0] > 0.4
+    assert np.ravel(_Entering(pi, near, np.array([7.0])).act(z)).tolist() == [7.0, 7.0, 0.3, 0.9]
 
 
 # ---- unit circle
