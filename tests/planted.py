@@ -29,6 +29,7 @@ from hyrl_mj.stages.critical_set import CriticalSet
 from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.partition import Partition
 from hyrl_mj.tasks import Learning, Outcome, Scene, Task, trial
+from hyrl_mj.tasks.unit_circle import UnitCircle
 from hyrl_mj.viz import diagnosis, section
 from hyrl_mj.viz.figures import style
 
@@ -60,11 +61,12 @@ def shorten(patch):
         for key, value in new.items():
             patch.setitem(values, key, value)
     patch.setattr(presets, "_SMOKE_MODES", 4_096)
+    patch.setattr(UnitCircle, "max_steps", 80)  # from the far side it takes 63
     patch.setattr(distillation, "STEPS", 200)
     patch.setattr(counterexamples, "MOST_CELLS", 24)
     patch.setattr(cells, "STATES", 300)
     patch.setattr(episodes, "JUDGED", 40)
-    attack = {"attack_starts": 60, "attack_rounds": 2}
+    attack = {"attack_starts": 60, "attack_rounds": 1}
     spare(patch, checkpoints=2, batches=2, nodes=12, episodes=60, **attack)
     spare_environments(patch)
     without_pictures(patch)
@@ -106,14 +108,15 @@ def without_videos(patch):
     patch.setattr("hyrl_mj.viz.replay.render_replay", no_renderer)
 
 
-def few_replays(patch):
-    """Patches what is replayed of proofs: without noise, and under one kind."""
+def few_noises(patch):
+    """Patches what is replayed of proofs and played as episodes: without noise, and under one kind."""
     noises = replays._noises
 
     def few(*arguments):
         return {k: v for k, v in noises(*arguments).items() if k in ("none", "alternating")}
 
     patch.setattr(replays, "_noises", few)
+    patch.setattr(examination, "usual_kinds", lambda *_: ("none", "uniform"))
 
 
 def spare(patch, **effort):

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from command_line import call
-from planted import few_replays, spare
+from planted import few_noises, spare
 from sentences import assert_has_ended
 
 import hyrl_mj
@@ -334,7 +334,7 @@ WHOLE = ("run", "unit_circle", "--preset", "smoke", "--out")
 def make_sac_run(folder):
     """Makes the run of the manual's page about algorithms."""
     with pytest.MonkeyPatch.context() as patch:
-        few_replays(patch)
+        few_noises(patch)
         done = call(*WHOLE, folder / "run", "--algorithm", "sac")
     assert_has_ended(done)
     (folder / "said").write_text(done.stdout)

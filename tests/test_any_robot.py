@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 from command_line import call
 from gl import needs_gl
-from planted import spare
+from planted import few_noises, spare
 from sentences import assert_has_ended
 
 import hyrl_mj
 from hyrl_mj import Outcome
 from hyrl_mj.gym_export.core import BatchedEnv
-from hyrl_mj.judging import examination
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.simulation import way_runs
 from hyrl_mj.tasks import registry, trial
@@ -148,7 +147,7 @@ def test_a_robot_from_its_own_folder_goes_through_the_whole_pipeline(
     small_runs, wasp, tmp_path, monkeypatch
 ):
     spare(monkeypatch, attack_starts=12, attack_rounds=1)
-    monkeypatch.setattr(examination, "usual_kinds", lambda *_: ("none", "uniform"))
+    few_noises(monkeypatch)
     assert len(WASP_PY.strip().splitlines()) <= 90
     words = ("--preset", "smoke", "--set", "rods=8", "cells=14", "lattice=20")
     words += ("stage1.samples=2048", "stage6.samples=2048")

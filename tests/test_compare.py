@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from command_line import call
-from planted import FEW_CELLS, few_replays, played_before, without_videos
+from planted import FEW_CELLS, few_noises, played_before, without_videos
 
 import hyrl_mj
 from hyrl_mj import BadInput
@@ -371,14 +371,13 @@ def folder(planted_circle, tmp_path_factory):
 def small():
     """Comparisons with little noise and no video."""
     with pytest.MonkeyPatch.context() as patch:
-        few_replays(patch)
+        few_noises(patch)
         without_videos(patch)
         patch.setattr(comparing, "CHOICE_STARTS", 16)
         patch.setattr(comparing, "CHOICE_ROUNDS", 1)
         patch.setattr(comparing, "EPISODES", 64)
         little = replace(steps.SPARING, episodes=20, attack_starts=12, attack_rounds=1)
         patch.setattr(steps, "SPARING", little)
-        patch.setattr(examination, "usual_kinds", lambda *_: ("none", "uniform"))
         yield
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from command_line import call, contents
 from gl import needs_gl
-from planted import circle_policy, few_replays, without_videos
+from planted import circle_policy, few_noises, without_videos
 from sentences import assert_has_ended
 from stable_baselines3 import DQN, PPO
 from test_agents import onnx_file, rewritten, saved, untrained
@@ -75,7 +75,7 @@ def make_robust(folder):
     path = folder / "run"
     options = ["vehicle", "--policy", folder / "agent.zip", "--preset", "smoke", "--out", path]
     with pytest.MonkeyPatch.context() as patch:
-        few_replays(patch)
+        few_noises(patch)
         diagnosed = call("diagnose", *options)
         assert diagnosed.returncode == 0, diagnosed.stderr
         before = contents(path)
@@ -100,7 +100,7 @@ def circle_run(small_runs, tmp_path_factory):
     """A whole run on a function, but for its video."""
     path = tmp_path_factory.mktemp("runs") / "circle"
     with pytest.MonkeyPatch.context() as patch:
-        few_replays(patch)
+        few_noises(patch)
         without_videos(patch)
         return hyrl_mj.robustify("unit_circle", off_centre, out=path, **SMOKE)
 

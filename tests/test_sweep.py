@@ -19,7 +19,7 @@ import pytest
 from attacks.crafted_runs import MARKER
 from attacks.doors import plant_modules
 from command_line import call
-from planted import FEW_CELLS, TINY, coarsen, decisions, few_replays, halves, shorten
+from planted import FEW_CELLS, TINY, coarsen, decisions, few_noises, halves, shorten
 from test_report import plant
 
 import hyrl_mj
@@ -350,7 +350,7 @@ def made_shortly(row, options, *more):
     """Does a run as the processes of a sweep do, but shorter."""
     shorten(patch := pytest.MonkeyPatch())
     coarsen(patch)
-    few_replays(patch)
+    few_noises(patch)
     return cluster.make(row, options, *more)
 
 
