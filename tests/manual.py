@@ -288,6 +288,7 @@ def shorten() -> None:
     patch.setattr(cores.Processes, "map", lambda pool, work, jobs: map(work, jobs))
     planted.shorten(patch)
     planted.coarsen(patch)
+    planted.few_noises(patch)
     planted.spare(patch, **EFFORT)
     planted.few_trials(patch)
     patch.setattr(steps, "SPARING", replace(steps.SPARING, **EFFORT))

@@ -17,6 +17,7 @@ from gl import needs_gl
 from PIL import Image
 from planted import played_before
 from sentences import assert_has_ended
+from test_algorithms import make_sac_run
 
 import hyrl_mj
 from hyrl_mj import BadInput
@@ -27,16 +28,15 @@ from hyrl_mj.viz.figures import FIGURES
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("small_runs")]  # whole runs
 
-SMOKE = ("--preset", "smoke")
+SMOKE = ("--preset", "smoke", "--algorithm", "sac")  # as `make_sac_run`
 
 
 @pytest.fixture(scope="module")
-def finished(small_runs, tmp_path_factory):
-    """A whole run of the unit circle in the smoke preset, made by the command line."""
-    path = tmp_path_factory.mktemp("runs") / "circle"
-    done = call("run", "unit_circle", *SMOKE, "--out", path)
-    assert_has_ended(done)
-    return path, done.stdout
+def finished(small_runs, made_once, tmp_path_factory):
+    """A whole run of the unit circle in the smoke preset, made by the command line, and what it said."""
+    folder = made_once("circle_sac", make_sac_run)
+    path = shutil.copytree(folder / "run", tmp_path_factory.mktemp("runs") / "circle")
+    return path, (folder / "said").read_text().replace(str(folder / "run"), str(path))
 
 
 @pytest.fixture
@@ -54,7 +54,7 @@ def assert_one_sentence(process, *parts):
 
 def test_run_ends_with_a_table_and_leaves_every_artifact(finished):
     path, said = finished
-    for words in ("policy (PPO)", "HyRL, q0 = 0", "HyRL, q0 = 1", "on M*", "critical set of"):
+    for words in ("policy (SAC)", "HyRL, q0 = 0", "HyRL, q0 = 1", "on M*", "critical set of"):
         assert words in said
     names = ["config.json", "policy.safetensors", "policy.json", "critical_set.npz"]
     names += ["partition.npz", "extended_sets.npz", "mode_0.safetensors", "mode_1.safetensors"]
