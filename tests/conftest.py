@@ -195,6 +195,19 @@ def few_steps():
         yield
 
 
+@pytest.fixture
+def quickly_judged(monkeypatch):
+    """Judging policies takes most of the time of a short training: it is done seldom, in short episodes."""
+    from planted import spare
+
+    from hyrl_mj.learning import training
+
+    spare(monkeypatch, checkpoints=2)
+    monkeypatch.setattr(training, "EPISODES", 64)
+    for name in ("unit_circle", "vehicle"):
+        monkeypatch.setattr(type(hyrl_mj.get_task(name)), "max_steps", 40)
+
+
 @pytest.fixture(scope="session", autouse=True)
 def few_trials():
     """Environments are looked at for a shorter time."""

@@ -13,7 +13,6 @@ from sentences import assert_has_ended
 import hyrl_mj
 from hyrl_mj import BadInput
 from hyrl_mj.gym_export.core import BatchedEnv
-from hyrl_mj.learning import training
 from hyrl_mj.learning.presets import preset
 from hyrl_mj.learning.settings import PRESETS
 from hyrl_mj.learning.training import build, check_foreign, evaluate, export, threads, train
@@ -140,13 +139,6 @@ def quick(task, algorithm, known=None):
     """Smoke settings of an algorithm with few samples, as many as for the known one of SB3."""
     stage1 = preset(task, "smoke", algorithm=algorithm).stage1
     return replace(stage1, samples=FEW[known or algorithm])
-
-
-@pytest.fixture
-def quickly_judged(monkeypatch):
-    """Judging policies takes most of the time of a short training."""
-    spare(monkeypatch, checkpoints=2)
-    monkeypatch.setattr(training, "EPISODES", 64)
 
 
 # ---- the algorithms of SB3

@@ -23,7 +23,9 @@ from hyrl_mj.viz import figures
 
 
 @pytest.mark.slow
-def test_a_run_stops_where_stage_1_has_not_learned_unless_told_to_go_on(tmp_path, monkeypatch):
+def test_a_run_stops_where_stage_1_has_not_learned_unless_told_to_go_on(
+    quickly_judged, tmp_path, monkeypatch
+):
     short = {"stage1.samples": 4_096, "stage1.attempts": 2}
     options = {"set": short, "out": tmp_path / "run", "say": lambda text: None}
     shown = tmp_path / "run" / "figures" / "arrivals.png"

@@ -39,12 +39,12 @@ def few_runs(monkeypatch):
 
 @pytest.fixture(scope="module")
 def puck():
-    return from_gymnasium(Puck, steps=120)
+    return from_gymnasium(Puck, steps=80)
 
 
 @pytest.fixture(scope="module")
 def slid():
-    return from_gymnasium(Slid, steps=120, bounds={"x": (-2.3, 2.3), "y": (-1.7, 1.7)})
+    return from_gymnasium(Slid, steps=80, bounds={"x": (-2.3, 2.3), "y": (-1.7, 1.7)})
 
 
 def of_masks(grid, *masks):

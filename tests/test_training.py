@@ -26,9 +26,7 @@ FEW = {"ppo": 4_096, "dqn": 4_000}
 
 
 @pytest.fixture
-def quick(task, monkeypatch):
-    spare(monkeypatch, checkpoints=2)
-    monkeypatch.setattr(training, "EPISODES", 64)
+def quick(task, quickly_judged):
     return replace(preset(task, "smoke").stage1, samples=FEW[task.learning.algorithm])
 
 
