@@ -24,6 +24,7 @@ from test_agents import (
     state_of,
     untrained,
     with_tensors,
+    zipped,
 )
 
 import hyrl_mj
@@ -54,11 +55,8 @@ def with_metadata(path, **entries):
 
 def compressed(path, **changes):
     """The zip with some members changed and all of them compressed."""
-    content = members(path) | {n.replace("_pth", ".pth"): c for n, c in changes.items()}
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
-        for name, data in content.items():
-            file.writestr(name, data)
-    return path
+    changed = {n.replace("_pth", ".pth"): c for n, c in changes.items()}
+    return zipped(path, members(path) | changed, zipfile.ZIP_DEFLATED)
 
 
 # ---- sizes
@@ -103,15 +101,12 @@ def test_texts_from_the_file_are_cut_in_messages(agent, circle):
     refused(agent, circle, r"its inputs lie in \[1, 2\] x .*\.\.\.")
 
 
-def with_pickle(path, content):
-    """The zip whose policy.pth holds another pickle."""
-    parts = members(io.BytesIO(members(path)["policy.pth"]))
+def with_pickle(path, weights, change):
+    """The zip with these weights, in whose pickle something is changed."""
+    parts = members(io.BytesIO(weights))
     name = next(name for name in parts if name.endswith("data.pkl"))
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as file:
-        for other, data in (parts | {name: content}).items():
-            file.writestr(other, data)
-    return rewritten(path, policy_pth=buffer.getvalue())
+    changed = zipped(io.BytesIO(), parts | {name: change(parts[name])})
+    return rewritten(path, policy_pth=changed.getvalue())
 
 
 # (x, x) of (x, x) of ...: each tuple is twice the one that was memoised before.
@@ -137,7 +132,8 @@ DOUBLING = b")" + b"".join(b"q%ch%c\x86" % (i, i) for i in range(100))
     ],
 )
 def test_a_pickle_that_would_grow_or_call_is_refused(content, agent, circle):
-    refused(with_pickle(agent, content), circle, "policy.pth")
+    weights = members(agent)["policy.pth"]
+    refused(with_pickle(agent, weights, lambda _: content), circle, "policy.pth")
 
 
 def test_pickles_are_read_without_unpickling(monkeypatch):
@@ -198,20 +194,14 @@ def test_tensors_are_read_without_torch(agent, circle, monkeypatch):
 @pytest.mark.parametrize("shape", [(2**30, 2**30), (2**60,), (1,) * 60, (-1, 5), (3, 3)], ids=str)
 def test_absurd_shapes_are_refused(shape, agent, circle):
     """The shape of a tensor of 8 numbers is written over by hand."""
-    size = len(shape) * b"\x01"
-    assert size  # one step along each dimension
-    state = packed({"x": torch.arange(8.0)})
-    parts = members(io.BytesIO(state))
-    name = next(name for name in parts if name.endswith("data.pkl"))
-    old = pickle.dumps((8,), 2)[2:-1]
     number = b"".join(pickle.dumps(n, 2)[2:-1] for n in shape)
-    assert parts[name].count(b"K\x08\x85") == 1, old
-    parts[name] = parts[name].replace(b"K\x08\x85", b"(" + number + b"t", 1)
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as file:
-        for other, data in parts.items():
-            file.writestr(other, data)
-    refused(rewritten(agent, policy_pth=buffer.getvalue()), circle, "policy.pth")
+
+    def reshaped(content):
+        assert content.count(b"K\x08\x85") == 1, pickle.dumps((8,), 2)[2:-1]
+        return content.replace(b"K\x08\x85", b"(" + number + b"t", 1)
+
+    weights = packed({"x": torch.arange(8.0)})
+    refused(with_pickle(agent, weights, reshaped), circle, "policy.pth")
 
 
 # ---- what cannot be right

@@ -36,11 +36,24 @@ def steering(task):
     return act
 
 
+def starts_of_vehicle(n):
+    return np.random.default_rng(0).uniform((0, 0.3), (0.2, 0.4), (n, 2))
+
+
+def test_what_the_traps_below_are_set_in_is_taken(circle, vehicle):
+    for task in (circle, vehicle):
+        read_agent(task, steering(task))
+    read_agent(circle, Honest())
+    read_agent(vehicle, Plain(vehicle, ""))
+    for n in (1, 20, 300):
+        agent = hyrl_mj.from_callable(turning, vehicle)
+        simulate(vehicle, agent, starts_of_vehicle(n), Noise("uniform", 0.1))
+
+
 @pytest.mark.parametrize("name", TASKS)
 @pytest.mark.parametrize("trap", TRAPS)
 def test_who_answers_otherwise_is_refused_with_both_answers(trap, name):
     task = hyrl_mj.get_task(name)
-    read_agent(task, steering(task))
     with pytest.raises(
         BadInput,
         match=r"the function answers the measurement \(.*\) with \(.*\) and, .*, "
@@ -61,14 +74,12 @@ IN_LOOPS = ("holds_six", "filters", "delays", "draws", "normalises_running", "co
 @pytest.mark.parametrize("starts", [1, 20])
 def test_a_closed_loop_notices_it_too(trap, starts, vehicle):
     """From one start, too, and without a trial before."""
-    z0 = np.random.default_rng(0).uniform((0, 0.3), (0.2, 0.4), (starts, 2))
     late = {"calls": 20} if trap == "counts" else {}
-    simulate(vehicle, hyrl_mj.from_callable(turning, vehicle), z0, Noise("uniform", 0.1))
     agent = hyrl_mj.from_callable(TRAPS[trap](turning, vehicle, **late), vehicle)
     with pytest.raises(
         BadInput, match=r"the function answers .* and, (asked again later|in a batch)"
     ):
-        simulate(vehicle, agent, z0, Noise("uniform", 0.1))
+        simulate(vehicle, agent, starts_of_vehicle(starts), Noise("uniform", 0.1))
 
 
 def test_a_closed_loop_of_many_runs_notices_what_begins_later(vehicle):
@@ -76,11 +87,9 @@ def test_a_closed_loop_of_many_runs_notices_what_begins_later(vehicle):
         late = observation[:, 1].mean() < 2.8 and len(observation) > 8  # on its way
         return turning(observation.mean(axis=0) + 0 * observation if late else observation)
 
-    z0 = np.random.default_rng(0).uniform((0, 0.3), (0.2, 0.4), (300, 2))
-    simulate(vehicle, hyrl_mj.from_callable(turning, vehicle), z0, Noise("uniform", 0.1))
     agent = hyrl_mj.from_callable(of_the_rows, vehicle)
     with pytest.raises(BadInput, match=r"the function answers .* and, in a batch"):
-        simulate(vehicle, agent, z0, Noise("uniform", 0.1))
+        simulate(vehicle, agent, starts_of_vehicle(300), Noise("uniform", 0.1))
 
 
 class Plain:
@@ -116,7 +125,6 @@ class Plain:
     ],
 )
 def test_what_else_a_policy_may_do_is_named(spoils, message, vehicle):
-    read_agent(vehicle, Plain(vehicle, ""))
     with pytest.raises(BadInput, match=message):
         read_agent(vehicle, Plain(vehicle, spoils))
 
@@ -501,7 +509,6 @@ SPOILT = {
 @pytest.mark.parametrize("kind", SPOILT)
 def test_a_memory_that_is_none_is_refused(kind, circle):
     make, message = SPOILT[kind]
-    read_agent(circle, Honest())
     with pytest.raises(BadInput, match=message):
         read_agent(circle, make())
 

@@ -144,7 +144,7 @@ def short_trials():
 @needs_gl
 @pytest.mark.slow
 def test_a_robot_from_its_own_folder_goes_through_the_whole_pipeline(
-    small_runs, wasp, tmp_path, monkeypatch
+    small_runs, quickly_judged, wasp, tmp_path, monkeypatch
 ):
     spare(monkeypatch, attack_starts=12, attack_rounds=1)
     few_noises(monkeypatch)

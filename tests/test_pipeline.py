@@ -93,12 +93,6 @@ def test_another_result_makes_those_that_were_made_from_it_out_of_date(run):
         _ = hyrl_mj.load_run(run.path).robustness
 
 
-def test_a_missing_result_makes_its_stage_undone(run):
-    before = stages_done(run)
-    (run.path / "mode_1.safetensors").unlink()
-    assert [name for name in before if name not in stages_done(run)] == ["retrain"]
-
-
 # ---- one stage
 
 

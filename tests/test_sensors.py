@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from manual import ROOT
+from planted import few_noises
 
 import hyrl_mj
 from hyrl_mj import BadInput, Noise, RunOptions, Sensor, cli
@@ -377,7 +378,9 @@ def test_what_is_no_log_of_a_task_is_refused(log, tmp_path):
 def make_late(folder):
     """Makes the run of the manual's page about sensors."""
     text = "uniform 0.05 + bias 0.05 + delay 1"
-    hyrl_mj.run(VEHICLE, noise=text, preset="smoke", out=folder / "run", say=str)
+    with pytest.MonkeyPatch.context() as patch:
+        few_noises(patch)
+        hyrl_mj.run(VEHICLE, noise=text, preset="smoke", out=folder / "run", say=str)
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ import pytest
 from attacks.crafted_runs import MARKER
 from attacks.doors import plant_modules
 from command_line import call
-from planted import FEW_CELLS, TINY, coarsen, decisions, few_noises, halves, shorten
+from planted import FEW_CELLS, TINY, coarsen, decisions, few_noises, halves, shorten, spare
 from test_report import plant
 
 import hyrl_mj
@@ -351,6 +351,7 @@ def made_shortly(row, options, *more):
     shorten(patch := pytest.MonkeyPatch())
     coarsen(patch)
     few_noises(patch)
+    spare(patch, nodes=6, episodes=20, attack_starts=12)
     return cluster.make(row, options, *more)
 
 
