@@ -108,7 +108,7 @@ def test_a_slanted_critical_line(search, vehicle):
     assert errors[1] < errors[0] / 4
 
 
-# ---- three dimensions
+# ---- three dimensions and more
 
 
 def test_a_critical_plane(search):
@@ -120,15 +120,21 @@ def test_a_critical_plane(search):
     assert np.abs(heights(critical.points) - 0.2).max() <= share * critical.spacing
 
 
-def test_a_critical_sphere(search):
-    cube = Cube(radii)
-    errors = []
-    for share in (1 / 2, 1 / 8):
-        critical = search(cube, sphere_policy(cube, 0.6), 10, share)
+@pytest.mark.parametrize(
+    ("d", "radius", "grids", "gain"),
+    [
+        (3, 0.6, ((10, 1 / 2), (10, 1 / 8)), 2),
+        pytest.param(4, 0.8, ((4, 1 / 8), (6, 1 / 8)), 1, marks=pytest.mark.slow),
+    ],
+)
+def test_a_critical_sphere(search, d, radius, grids, gain):
+    ball, errors = Cube(radii, d), []
+    for cells, share in grids:
+        critical = search(ball, sphere_policy(ball, radius), cells, share)
         assert critical.pieces == 1
-        errors.append(np.abs(radii(critical.points) - 0.6).max())
-        assert errors[-1] <= share * critical.spacing
-    assert errors[1] < errors[0] / 2
+        errors.append(np.abs(radii(critical.points) - radius).max())
+        assert errors[-1] <= min(critical.resolution, share * critical.spacing)
+    assert errors[1] < errors[0] / gain
 
 
 def test_two_critical_planes_are_two_pieces(search):
@@ -140,21 +146,6 @@ def test_two_critical_planes_are_two_pieces(search):
         s = heights(critical.points[critical.component == k])
         assert np.abs(np.abs(s) - 0.6).max() <= critical.resolution
         assert len(set(np.sign(s))) == 1
-
-
-# ---- four dimensions
-
-
-@pytest.mark.slow
-def test_a_critical_sphere_in_four_dimensions(search):
-    ball = Cube(radii, 4)
-    errors = []
-    for cells in (4, 6):
-        critical = search(ball, sphere_policy(ball, 0.8), cells, 1 / 8)
-        assert critical.pieces == 1
-        errors.append(np.abs(radii(critical.points) - 0.8).max())
-        assert errors[-1] <= critical.resolution
-    assert errors[1] < errors[0]
 
 
 # ---- both searches

@@ -312,24 +312,16 @@ def test_nodes_inside_of_walls_make_no_way_rare():
     assert ways.dropped == ()
 
 
-def test_only_runs_that_arrive_make_modes():
+@pytest.mark.parametrize("arrive", [(True, False, True, True), (False,) * 4])
+def test_only_runs_that_arrive_make_modes_and_all_do_if_none_arrives(arrive):
     field = Field(row(2))
     paths = along(*(past(field.posts, way) for way in product((LEFT, RIGHT), repeat=2)))
-    arrived = np.array([True, False, True, True])
-    ways = HomotopyClasses.from_runs(field, runs_along(field, paths, arrived), NO_PAIRS)
-    assert [LEFT, RIGHT] not in ways.patterns.tolist()
-    assert len(ways.modes) == 3
-    assert ways.arriving
-
-
-def test_if_nothing_arrives_all_runs_show_ways():
-    field = Field(row(2))
-    paths = along(*(past(field.posts, way) for way in product((LEFT, RIGHT), repeat=2)))
-    runs = runs_along(field, paths, np.zeros(4, dtype=bool))
+    runs = runs_along(field, paths, np.array(arrive))
     ways = HomotopyClasses.from_runs(field, runs, NO_PAIRS)
-    assert len(ways.modes) == 4
-    assert not ways.arriving
-    assert ways.works(runs).all()
+    assert ways.arriving == any(arrive)
+    assert len(ways.modes) == (sum(arrive) or 4)
+    assert ([LEFT, RIGHT] in ways.patterns.tolist()) == (not ways.arriving)
+    assert ways.arriving or ways.works(runs).all()
 
 
 @pytest.mark.parametrize("posts", [5, 6])
