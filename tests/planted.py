@@ -16,10 +16,10 @@ from hyrl_mj.files.artifacts import digest
 from hyrl_mj.files.manifest import FILES, Entry, Manifest
 from hyrl_mj.gym_import import draws, inspection, resets, starts, trials
 from hyrl_mj.gym_import.task import EnvironmentTask
-from hyrl_mj.judging import episodes, examination, worst_case
+from hyrl_mj.judging import episodes, examination, results, worst_case
 from hyrl_mj.judging.game import Maps
 from hyrl_mj.judging.proof import cells, counterexamples, replays
-from hyrl_mj.learning import distillation, presets
+from hyrl_mj.learning import distillation, presets, training
 from hyrl_mj.pipeline import steps
 from hyrl_mj.policies.hybrid import HybridController
 from hyrl_mj.runs.directory import load_run
@@ -66,6 +66,8 @@ def shorten(patch):
     patch.setattr(counterexamples, "MOST_CELLS", 24)
     patch.setattr(cells, "STATES", 300)
     patch.setattr(episodes, "JUDGED", 40)
+    patch.setattr(training, "EPISODES", 64)
+    patch.setattr(results, "EPISODES", 100)
     attack = {"attack_starts": 60, "attack_rounds": 1}
     spare(patch, checkpoints=2, batches=2, nodes=12, episodes=60, **attack)
     spare_environments(patch)
