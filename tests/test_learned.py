@@ -49,7 +49,7 @@ def test_a_run_stops_where_stage_1_has_not_learned_unless_told_to_go_on(
 
 @pytest.mark.parametrize(("minutes", "trainings"), [(60, 2), (1e-9, 1)])
 def test_another_attempt_is_paid_for_the_way_to_the_goal_if_there_is_time(
-    minutes, trainings, tmp_path, monkeypatch
+    minutes, trainings, quickly_judged, tmp_path, monkeypatch
 ):
     """The first training gives a policy that never arrives, the second is what it is without training."""
     train, given = training.train, []
