@@ -35,7 +35,6 @@ from .pipeline import (
     sweep,
 )
 from .policies import Controller, HybridController, MlpPolicy, Policy, from_callable, load_agent
-from .runs.directory import Run, load_run
 from .sets import Chart, StateSet
 from .simulation import (
     HybridArc,
@@ -63,6 +62,7 @@ from .system import gl as gl
 from .system.cores import using_pool
 from .tasks import Learning, Mirror, Outcome, Scene, Task, get_task, register, task_names
 from .viz.figures.vector_field import vector_field
+from .viz.notebook import Run, load_run
 
 __version__: str
 __all__ = [

@@ -21,7 +21,8 @@ from hyrl_mj.judging.game import LATTICE
 from hyrl_mj.learning import Settings, Training, changed, preset
 from hyrl_mj.pipeline.steps import DIAGNOSIS, STAGES, extended_sets_stage, run_stage
 from hyrl_mj.policies import ALGORITHMS, FUNCTION, AnyPolicy, algorithms, read_agent
-from hyrl_mj.runs.directory import Run, load_run, opened, write_config
+from hyrl_mj.runs import directory
+from hyrl_mj.runs.directory import opened, write_config
 from hyrl_mj.runs.sweeps import MOST_RUNS
 from hyrl_mj.sets import coarseness
 from hyrl_mj.simulation import Sensor, judge_task
@@ -37,7 +38,7 @@ from hyrl_mj.tasks import (
     overlooked,
     try_elsewhere,
 )
-from hyrl_mj.viz import beginning
+from hyrl_mj.viz import Run, beginning, load_run
 
 # The paper's bound of the noise.
 BOUND = 0.1
@@ -233,9 +234,9 @@ def usable_task(task: str | Path | Task) -> Task:
     return check_task(found)
 
 
-def extend_again(run: Run, horizon: float, say: Say = print) -> Run:
+def extend_again(run: directory.Run, horizon: float, say: Say = print) -> Run:
     """Runs stages 4 and 5 with another horizon T [s], and writes T to `config.json` if they succeed."""
-    changed = Run(run.path, replace(run.settings, horizon=horizon), run.function)
+    changed = directory.Run(run.path, replace(run.settings, horizon=horizon), run.function)
     with locked(run.path):
         with changed.manifest.stage("extended-sets"):
             extended_sets_stage(changed, lambda text: say(f"extended-sets: {text}"))
@@ -244,7 +245,9 @@ def extend_again(run: Run, horizon: float, say: Say = print) -> Run:
     return load_run(run.path, run.function)
 
 
-def _run_all(run: Run, say: Say, stages: Collection[str] = STAGES, learned: bool = False) -> Run:
+def _run_all(
+    run: directory.Run, say: Say, stages: Collection[str] = STAGES, learned: bool = False
+) -> Run:
     """Runs the stages that are not done; those after the first only if it has `learned`, if that is asked."""
     if not run.manifest.is_done("critical-set"):
         judge_task(run.task)
@@ -271,10 +274,10 @@ def _run_all(run: Run, say: Say, stages: Collection[str] = STAGES, learned: bool
             run = run_stage(run, stage, say)
         if stage == "train" and learned:
             _check_learned(run)
-    return run
+    return Run.of(run)
 
 
-def _check_learned(run: Run) -> None:
+def _check_learned(run: directory.Run) -> None:
     """Raises `HyrlError` if the policy of stage 1 arrives from less than half of the starts."""
     task, settings, arrivals = run.task, run.settings.stage1, run.arrivals
     if arrivals.most:
@@ -343,7 +346,9 @@ def _settings(task: Task, options: RunOptions | AgentOptions, **changes: Any) ->
 
 
 @contextmanager
-def _with_agent(task: str | Path | Task, policy: AnyPolicy, options: AgentOptions) -> Iterator[Run]:
+def _with_agent(
+    task: str | Path | Task, policy: AnyPolicy, options: AgentOptions
+) -> Iterator[directory.Run]:
     """Opens the run directory of an agent, which then holds the agent, and holds its lock in the block."""
     checked = usable_task(task)
     _settings(checked, options)  # a wrong value is reported before the agent is read
@@ -363,7 +368,7 @@ def _with_agent(task: str | Path | Task, policy: AnyPolicy, options: AgentOption
         yield run
 
 
-def examination_plan(run: Run) -> str:
+def examination_plan(run: directory.Run) -> str:
     """Returns how a run will be examined, and why not in another way, before anything is trained."""
     if run.why_no_game:
         return f"by noisy episodes and an attack, because {run.why_no_game}"

@@ -50,7 +50,7 @@ def critical_starts(run: Run) -> np.ndarray:
 def noisy_arcs(
     run: Run,
     z0: np.ndarray,
-    noise: str,
+    noise: str | AnyNoise,
     eps: float | None = None,
     q0s: Sequence[int | None] = (None,),
     horizon: float | None = None,
@@ -62,8 +62,8 @@ def noisy_arcs(
     Args:
         run: with its mode policies.
         z0: starts.
-        noise: a registered kind; "worst": that of the worst-case game, for each controller; or "attack": the
-            strongest signal that a search of four rounds finds, for each controller.
+        noise: a registered kind; "worst": that of the worst-case game, for each controller; "attack": the
+            strongest signal that a search of four rounds finds, for each; or a noise with its bound.
         eps: bound of the noise, by default the run's.
         q0s: start modes of the hybrid controller; with None it picks its start mode.
         horizon: time [s], by default the task's.
@@ -78,7 +78,11 @@ def noisy_arcs(
     """
     task = run.task  # first: the file of a user's task may register noise
     kinds = (*noise_kinds(), *OF_RUNS)
-    sensor = noise_of(task, noise, 0.0) if " " in noise.strip() else None
+    sensor: AnyNoise | None = None
+    if not isinstance(noise, str):
+        sensor, noise = noise, str(noise)
+    elif " " in noise.strip():
+        sensor = noise_of(task, noise, 0.0)
     if sensor is None and noise not in kinds:
         raise unknown(
             "noise", noise, [*kinds, "a sum as 'uniform 0.05 + delay 1'", "'log LOG.csv'"]
@@ -142,7 +146,7 @@ class _Begun:
 
 
 def replay_arcs(
-    run: Run, noise: str | None = None, eps: float | None = None
+    run: Run, noise: str | AnyNoise | None = None, eps: float | None = None
 ) -> dict[tuple[str, str], HybridArc]:
     """Simulates the replays by start and controller: of the scene (paper, Section V), and one on M*.
 

@@ -394,18 +394,7 @@ class Run:
 def load_run(
     path: str | Path, policy: AnyPolicy | None = None, task: str | Path | Task | None = None
 ) -> Run:
-    """Opens a run directory. No code runs but that of installed packages.
-
-    Args:
-        path: the directory.
-        policy: the agent of the run, if it is Python code, which no file can hold.
-        task: the Python file that defines the task, if the task is the user's and this machine has not run
-            it before. The file is executed.
-
-    Raises:
-        BadArtifact: the directory holds no run, or a link.
-        BadInput: the task is in a file that must be named first.
-    """
+    """Opens a run directory, as `hyrl_mj.load_run`."""
     path = Path(path)
     config = path / "config.json"
     if not config.is_file():

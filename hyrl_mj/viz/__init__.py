@@ -6,6 +6,7 @@ import matplotlib, Pillow or a GL library, so they are imported only where they 
 
 from hyrl_mj.viz.commands import beginning
 from hyrl_mj.viz.compared_tables import print_compared
+from hyrl_mj.viz.notebook import Run, load_run
 from hyrl_mj.viz.options import ReplayOptions
 from hyrl_mj.viz.sweep_tables import print_sweep
 from hyrl_mj.viz.tables import (
@@ -18,6 +19,7 @@ from hyrl_mj.viz.tables import (
 
 __all__ = [
     "ReplayOptions",
+    "Run",
     "beginning",
     "compared_page",
     "diagnosis",
@@ -25,6 +27,8 @@ __all__ = [
     "encoding",
     "figures",
     "live",
+    "load_run",
+    "notebook",
     "pages",
     "print_compared",
     "print_noise",

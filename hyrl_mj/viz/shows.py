@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from numpy.typing import ArrayLike
+
 from hyrl_mj.errors import BadInput, unknown
-from hyrl_mj.runs.arcs import attack_replay, replay_arcs
+from hyrl_mj.runs.arcs import attack_replay, noisy_arcs, replay_arcs
 from hyrl_mj.runs.directory import Run
+from hyrl_mj.simulation import AnyNoise
 from hyrl_mj.viz.replay import Floor, Floors, Show
 from hyrl_mj.viz.section import critical_sets, sections
 
 
 def replay_shows(
-    run: Run, starts: str = "critical", noise: str | None = None, eps: float | None = None
+    run: Run,
+    starts: str | ArrayLike = "critical",
+    noise: str | AnyNoise | None = None,
+    eps: float | None = None,
 ) -> list[Show]:
     """Returns the shows that a replay plays.
 
@@ -18,13 +24,18 @@ def replay_shows(
         run: with its arcs.
         starts: "critical" for the start on M*, once for each start mode, or where no game decides for
             the strongest signals of the attack; "paper" for all of the paper's
-            starts at once; "latest" for the arcs of the last `hyrl-mj simulate --start`.
-        noise: the kind of noise of a new simulation; by default the arcs on disk are played.
+            starts at once; "latest" for the arcs of the last `hyrl-mj simulate --start`; or starts (n, d).
+        noise: of a new simulation, as in `noisy_arcs`; by default the arcs on disk are played, and starts
+            (n, d) are simulated under alternating noise.
         eps: the bound of a new simulation, by default the run's; without `noise` that of `replay_arcs`.
 
     Raises:
         BadInput: a value that cannot be used.
     """
+    if not isinstance(starts, str):
+        z0 = run.task.chart.check(starts, run.task.name)
+        found = noisy_arcs(run, z0, "alternating" if noise is None else noise, eps)
+        return [Show(found["policy"], found["hyrl"], run.policy_title, run.extended_sets.modes)]
     if starts not in (known := ("critical", "paper", "latest")):
         raise unknown("starts", starts, known)
     is_new, modes = noise is not None or eps is not None, run.extended_sets.modes

@@ -183,6 +183,33 @@ def robustness_tables(task: Task, robustness: Robustness) -> list[Table]:
     return tables
 
 
+def robustness_rows(robustness: Robustness) -> list[dict[str, Any]]:
+    """Returns what noise can do in numbers: a row for each kind of noise, its bound, and each controller.
+
+    A row has the kind of noise ("worst" is the worst-case game), its bound `eps`, the controller, the share
+    that is `lost`, and where starts were drawn the 95% interval of the share, `lost_low` to `lost_high`, and
+    how many `runs` there were. Episodes have a row for each region of `starts`. Rows of the game have the
+    fields of `Score`, too, whose shares are of the winnable starts.
+    """
+    rows: list[dict[str, Any]] = []
+    for who, level in robustness.game.scores.items() if robustness.game else ():
+        for score in level:
+            row = {"noise": "worst", "controller": who, "lost": 1 - score.not_broken}
+            rows.append(row | vars(score))
+    for e in robustness.episodes:
+        low, high = (1 - share for share in reversed(e.interval))
+        row = {"noise": e.noise, "controller": e.controller, "lost": 1 - e.reached, "eps": e.eps}
+        rows.append(
+            row | {"lost_low": low, "lost_high": high, "runs": e.episodes, "starts": e.region}
+        )
+    for a in robustness.attacks:
+        low, high = a.interval
+        row = {"noise": "attack", "controller": a.controller, "lost": a.lost / max(a.attacked, 1)}
+        row |= {"eps": a.eps, "lost_low": low, "lost_high": high, "runs": sum(a.tried.values())}
+        rows.append(row)
+    return rows
+
+
 def score_table(task: Task, game: GameResult) -> Table:
     """Returns the scores of the worst-case game: a row for each noise bound and controller."""
     where, unit = task.noise_on(game.everywhere)
