@@ -52,6 +52,9 @@ class HybridController:
                     f"{sorted(self.policies)}: give one of each for every mode"
                 )
 
+    def __repr__(self) -> str:
+        return f"HybridController({self.task.name}, modes {', '.join(map(str, self.modes))})"
+
     @cached_property
     def modes(self) -> tuple[int, ...]:
         """The modes, in ascending order."""

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from numbers import Real
-from typing import TYPE_CHECKING, ClassVar, overload
+from typing import TYPE_CHECKING, Any, ClassVar, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,6 +20,7 @@ from hyrl_mj.simulation.rollout import LoopSettings, Rollout, closed_loop
 from hyrl_mj.tasks import Outcome, Task, get_task, task_names
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 # The longest time that `simulate` records [s]: an hour.
@@ -94,28 +95,53 @@ class HybridArc(Saved):
             f"{counted(self.j[-1], 'jump')}, {noise}"
         )
 
-    def plot(self) -> Figure:
-        """Returns a figure of the chart coordinates over time, coloured by mode, jumps as dashed lines."""
-        from hyrl_mj.system.picture import Picture  # matplotlib is slow to import
+    def plot(self, ax: Axes | Sequence[Axes] | None = None) -> Figure:
+        """Draws the chart coordinates over time, coloured by mode, with jumps as dashed lines.
 
-        dimension = self.z.shape[1]
-        figure = Picture(figsize=(6.4, 1.4 + 1.6 * dimension), layout="constrained")
-        panels = figure.subplots(dimension, sharex=True, squeeze=False)[:, 0]
-        figure.suptitle(f"{self.task}, {self._summary}", fontsize="medium")
+        Args:
+            ax: matplotlib's axes, one for each coordinate, or one for all; by default those of a new figure.
+
+        Returns:
+            The figure.
+
+        Raises:
+            BadInput: there are as many axes as neither of these.
+        """
+        from matplotlib.axes import Axes  # slow to import
+
+        from hyrl_mj.system.picture import Picture
+
+        labels = self._axis_labels()
+        if ax is None:
+            figure = Picture(figsize=(6.4, 1.4 + 1.6 * len(labels)), layout="constrained")
+            ax = list(figure.subplots(len(labels), sharex=True, squeeze=False)[:, 0])
+            figure.suptitle(f"{self.task}, {self._summary}", fontsize="medium")
+        panels = list(np.ravel(np.asarray(ax, dtype=object)))
+        if len(panels) not in (1, len(labels)) or not all(isinstance(p, Axes) for p in panels):
+            raise BadInput(
+                f"ax {ax!r:.80} cannot be used: give one of matplotlib's Axes, or {len(labels)}, as those of "
+                f"plt.subplots({len(labels)})"
+            )
         jumps = np.flatnonzero(np.diff(self.j))
         flows = np.split(np.arange(len(self.t)), jumps + 1)
-        for panel, label, z in zip(panels, self._axis_labels(), self.z.T, strict=True):
+        for i, (label, z) in enumerate(zip(labels, self.z.T, strict=True)):
+            panel = panels[i % len(panels)]
             for rows in flows:
                 mode = self.q[rows[0]]
-                panel.plot(self.t[rows], z[rows], color=f"C{mode}", label=f"mode {mode}")
+                name = "policy" if self.controller == "policy" else f"mode {mode}"
+                panel.plot(self.t[rows], z[rows], color=f"C{mode}", label=name)
             for t in self.t[jumps]:
                 panel.axvline(t, color="0.6", linestyle="--", linewidth=0.8, zorder=0)
-            panel.set_ylabel(label)
+            if len(panels) < len(labels):
+                looks: dict[str, Any] = {"textcoords": "offset points", "va": "center"}
+                panel.annotate(label, (self.t[-1], z[-1]), (4, 0), **looks)
+            else:
+                panel.set_ylabel(label)
         panels[-1].set_xlabel("t [s]")
-        lines, labels = panels[0].get_legend_handles_labels()
-        by_label = dict(zip(labels, lines, strict=True))
+        lines, names = panels[0].get_legend_handles_labels()
+        by_label = dict(zip(names, lines, strict=True))
         panels[0].legend(by_label.values(), by_label)
-        return figure
+        return panels[0].get_figure(root=True)
 
     def _axis_labels(self) -> list[str]:
         """Returns "x [m]" for each coordinate, or "z[0]" if the task is not registered."""

@@ -42,7 +42,7 @@ def replay_shows(
     if starts == "latest":
         if is_new:
             raise BadInput(
-                "the latest simulation has its noise: give --noise and --eps to simulate"
+                "the latest simulation has its noise: give noise and eps to hyrl-mj simulate, not here"
             )
         policy, hybrid = ([run.arc(run.latest_path(who))] for who in ("policy", "hyrl"))
         return [Show(policy, hybrid, run.policy_title, modes)]

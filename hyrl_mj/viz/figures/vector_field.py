@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from hyrl_mj.errors import BadInput
 from hyrl_mj.policies import Policy
 from hyrl_mj.runs.directory import Run
 from hyrl_mj.sets import Grid, GridSet
@@ -36,8 +37,10 @@ def vector_field(run: Run) -> Figure:
         The figure, with a panel for each loop.
 
     Raises:
-        BadInput: the chart is neither a plane nor a ring, nor has a section that is a plane.
+        BadInput: this is no run, or the chart is neither a plane nor a ring, nor has a plane section.
     """
+    if not hasattr(run, "extended_sets"):
+        raise BadInput(f"{run!r:.80} is no run: give that of hyrl_mj.load_run(PATH)")
     task, section = run.task, Section(run.task)
     charts.check_drawable(task)
     sets = section.extended_sets(run.extended_sets)

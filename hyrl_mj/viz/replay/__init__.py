@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import chain
+from numbers import Integral, Real
 from pathlib import Path
+
+import numpy as np
 
 from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.files import artifacts
@@ -64,11 +67,14 @@ def check_replay(task: Task, path: Path, options: ReplayOptions) -> None:
         raise BadInput(f"{path} is no replay: give a name that ends in one of {', '.join(formats)}")
     if options.layout not in (layouts := ("side-by-side", "overlay")):
         raise unknown("layout", options.layout, layouts)
-    if not 1 <= options.fps <= 240:
+    if not (isinstance(options.fps, Integral) and 1 <= options.fps <= 240):
         raise BadInput(f"no video has {options.fps} frames a second: give 1 to 240")
-    if not 1 <= options.slow_motion <= 100:
+    if not (isinstance(options.slow_motion, Real) and 1 <= options.slow_motion <= 100):
         raise BadInput(
-            f"slow motion {options.slow_motion:g} cannot be played: give 1 (real time) to 100"
+            f"slow motion {options.slow_motion} cannot be played: give 1 (real time) to 100"
         )
+    size = np.asarray(options.size)
+    if size.shape != (2,) or size.dtype.kind not in "iu":
+        raise BadInput(f"size {options.size!r} cannot be used: give width and height [pixels]")
     camera = options.camera or task.scene.camera
     mjcf.camera_of(task.model, camera)
