@@ -78,7 +78,7 @@ class Run:
         with suppress(HyrlError):
             content = self._checked("figures/overview.png").read_bytes()
             image = f"data:image/png;base64,{b64encode(content).decode()}"
-            parts.append(f'<img alt="overview" width="780" src="{image}">')
+            parts.append(f'<img alt="overview" width="780" style="max-width: 100%" src="{image}">')
         return "".join(parts)
 
     @cached_property
@@ -395,6 +395,8 @@ def load_run(
     path: str | Path, policy: AnyPolicy | None = None, task: str | Path | Task | None = None
 ) -> Run:
     """Opens a run directory, as `hyrl_mj.load_run`."""
+    if not isinstance(path, str | Path):
+        raise BadInput(f"{path!r:.80} is no run directory: give its path")
     path = Path(path)
     config = path / "config.json"
     if not config.is_file():

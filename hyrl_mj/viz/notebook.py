@@ -152,7 +152,7 @@ class Run(directory.Run):
         *,
         layout: str = "side-by-side",
         camera: str | None = None,
-        size: tuple[int, int] = (1280, 720),
+        size: tuple[int, int] = (960, 540),
         fps: int = 30,
         slow_motion: float = 1.0,
     ) -> Replay:

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.patches import Circle, Wedge
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MultipleLocator
 
 from hyrl_mj.errors import BadInput
@@ -94,6 +95,22 @@ def image(panel: Axes, grid: Grid, values: np.ndarray, **looks: Any) -> None:
 def legend_field(panel: Axes, label: str, face: str, edge: str = INK) -> None:
     """Gives the legend a filled field."""
     panel.fill([], [], facecolor=face, edgecolor=edge, linewidth=0.8, label=label)
+
+
+def words(
+    panel: Axes,
+    text: str,
+    x: float,
+    y: float,
+    off: tuple[float, float] = (0.0, 0.0),
+    colour: str = INK,
+) -> None:
+    """Writes words at a point, or `off` it [points] to one side, with a white edge."""
+    side = "center" if not off[0] else "left" if off[0] > 0 else "right"
+    looks: dict[str, Any] = {"color": colour, "ha": side, "va": "center", "zorder": 7}
+    looks |= {"textcoords": "offset points", "fontsize": 9.5, "annotation_clip": False}
+    looks["path_effects"] = [withStroke(linewidth=2.5, foreground=WHITE)]
+    panel.annotate(text, (x, y), off, **looks)
 
 
 # ---- rings

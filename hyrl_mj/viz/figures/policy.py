@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from textwrap import fill
+
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
@@ -9,6 +11,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import BoundaryNorm, Colormap, ListedColormap, Normalize
 from matplotlib.figure import Figure
+from scipy.spatial import cKDTree
 
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages import Partition
@@ -22,6 +25,10 @@ from hyrl_mj.viz.section import Section
 
 # Cells along the longest side of a map of inputs.
 MAP = 240
+# Words are about three times as wide as high: how far off they keep from what is drawn, along x and y.
+LABEL = np.array([3.0, 1.0])
+RIM = 0.88  # the radius of words on a ring, outside most runs
+NOISELESS = "without noise, coloured by its mode, if it has one"
 ENDS = {
     Outcome.RUNNING: OPEN,
     Outcome.REACHED: PALE,
@@ -40,9 +47,6 @@ def draw_overview(shown: ShownPolicy) -> Figure:
     with style.drawing(7.6, shown.section, title) as figure:
         panel = figure.subplots()
         panel.set_title(style.noise_label(task, arc.noise, arc.bound))
-        for i, mode in enumerate(shown.partition.modes):
-            part = f"only in {style.set_label(mode)}, of mode {task.mode_name(mode)}"
-            charts.legend_field(panel, part, style.mode_tint(i))
         if charts.is_ring(task.chart):
             _spirals(panel, shown)
         else:
@@ -68,6 +72,30 @@ def _field(panel: Axes, shown: ShownPolicy) -> None:
     looks = {"markersize": 13, "markerfacecolor": PALE, "markeredgecolor": INK}
     runs.mark(panel, view, arc, 0, triangle, **looks)
     charts.dots(panel, shown.critical.points)
+    _name_parts(panel, shown, owners)
+
+
+def _name_parts(panel: Axes, shown: ShownPolicy, owners: np.ndarray) -> None:
+    """Writes the name of each mode where its part, of `owners` (N,), has the most room in the plane."""
+    section, partition, arc = shown.section, shown.partition, shown.noisy
+    chart, nodes = section.chart, partition.grid.nodes
+    paths = [*(one.z for one in shown.noiseless), arc.z, shown.task.z(arc.measured[:-1])]
+    drawn = np.vstack([*(chart.wrap(z[:, :2]) for z in paths), nodes[section.failed(nodes)]])
+    room = (np.minimum(nodes - chart.low, chart.high - nodes) / LABEL).min(axis=1)
+    for i, mode in enumerate(partition.modes):
+        own = owners == i
+        others = cKDTree(np.vstack([drawn, nodes[~own]]) / LABEL)
+        at = nodes[np.argmax(np.minimum(room, others.query(nodes / LABEL)[0]) * own)]
+        if own.any():
+            charts.words(panel, _part_label(shown.task, mode), *at)
+            # In parts that are smaller than words these keep off each other.
+            room = np.minimum(room, np.linalg.norm((nodes - at) / LABEL, axis=1) / 4)
+
+
+def _part_label(task: Task, mode: int) -> str:
+    """Returns what stands in the part of a mode, in short lines: "M₀, mode 0 (left)"."""
+    text = f"{style.set_label(mode)}, mode {task.mode_name(mode)}"
+    return fill(text, 24, break_on_hyphens=False)
 
 
 def _owners(partition: Partition) -> np.ndarray:
@@ -106,15 +134,20 @@ def _spirals(panel: Axes, shown: ShownPolicy) -> None:
     if task.set_point is not None:
         charts.cross(panel, *np.ravel(charts.on_ring(task.chart, task.set_point)))
     charts.spokes(panel, task.chart, shown.critical.points, CORE - 0.06)
+    owners = _owners(partition)
+    for i, mode in enumerate(partition.modes):
+        # In the middle of the part, whatever node the period begins with.
+        x, y = charts.on_ring(task.chart, partition.grid.nodes[owners == i, 0])
+        if len(x):
+            middle = np.array([x.mean(), y.mean()])
+            charts.words(panel, _part_label(task, mode), *(RIM * middle / np.linalg.norm(middle)))
 
 
 def _noiseless_runs(panel: Axes, shown: ShownPolicy, view: View) -> None:
     """Draws the runs without noise, with an arrowhead after a seventh of their samples."""
     looks = {"linewidth": 1.3, "zorder": 3}
     for arc in shown.noiseless:
-        drawn = runs.chosen_way(
-            panel, shown, view, arc, "without noise, coloured by its way", **looks
-        )
+        drawn = runs.chosen_way(panel, shown, view, arc, NOISELESS, **looks)
         row = len(arc.t) // 7
         points = view.points(arc.t[row : row + 2], arc.z[row : row + 2])
         if len(points) < 2 or (np.abs(points[1] - points[0]) > view.longest).any():
@@ -128,12 +161,13 @@ def _noisy_run(panel: Axes, shown: ShownPolicy, view: View) -> None:
     """Draws the run under noise and what it measures."""
     task, arc = shown.task, shown.noisy
     looks = {"color": POLICY, "linewidth": 1.4, "zorder": 4}
-    runs.line(panel, view, arc.t, arc.z, label=f"{shown.policy_title}, with noise", **looks)
-    charts.legend_field(panel, "what it can observe, and does (dots)", OBSERVED, OBSERVED)
+    label = f"{shown.policy_title} with noise, and what it can observe"
+    charts.legend_field(panel, label, OBSERVED, OBSERVED)
+    runs.line(panel, view, arc.t, arc.z, label=label, **looks)
     looks = {"linestyle": "none", "marker": ".", "color": BAD, "markersize": 4, "zorder": 4.5}
     measured = task.z(arc.measured[:-1])
     runs.line(panel, view, arc.t[:-1], measured, **looks)
-    runs.end(panel, task, view, arc)
+    runs.end(panel, task, view, arc, beside=True)
 
 
 # ---- where it does not arrive

@@ -86,14 +86,19 @@ def ends(panel: Axes, task: Task, view: View, arc: HybridArc) -> None:
     end(panel, task, view, arc)
 
 
-def end(panel: Axes, task: Task, view: View, arc: HybridArc) -> None:
-    """Marks where a run ends, in red if it has failed."""
+def end(panel: Axes, task: Task, view: View, arc: HybridArc, beside: bool = False) -> None:
+    """Marks where a run ends, in red if it has failed; how it ends tells the legend, or words `beside` it."""
     label, colour = ("end", INK) if arc.arrives(task) else ("end: off the set-point", PALE)
     if arc.outcome != "reached":
         label, colour = f"end: {arc.outcome.replace('_', ' ')}", BAD
         if arc.outcome == "running":
             label = "end, not there yet"
-    mark(panel, view, arc, -1, "x", color=colour, markeredgewidth=2, label=label)
+    if beside:
+        ((x, y),) = view.points(arc.t[[-1]], arc.z[[-1]])
+        inner = x > np.mean(panel.get_xlim())
+        left = inner == panel.axison  # where there is room: of a ring that is outside
+        charts.words(panel, label.removeprefix("end: "), x, y, (-7 if left else 7, 10), colour)
+    mark(panel, view, arc, -1, "x", color=colour, markeredgewidth=2, label="" if beside else label)
 
 
 def chosen_way(
@@ -104,18 +109,20 @@ def chosen_way(
     same: str = "",
     **looks: Any,
 ) -> Line2D:
-    """Draws a policy's run in the colour of the mode whose way it goes; `same` labels all such runs."""
+    """Draws a policy's run in the colour of the mode whose way it goes, else grey; `same` labels all."""
     task, modes = shown.task, shown.partition.modes
     going = modes_of(task, modes, int(task.direction(arc.z[:, None])[0]))
     if arc.outcome != "reached":
-        colour, label = POLICY, "neither way" if len(modes) < 3 else "no way to the end"
+        colour = PALE if same else POLICY
+        label = "neither way" if len(modes) < 3 else "no way to the end"
     elif len(going) == 1:
         mode = going[0]
         colour = mode_colour(modes.index(mode))
-        label = same or f"way of mode {task.mode_name(mode)}"
+        label = f"way of mode {task.mode_name(mode)}"
     else:
         colour, label = PALE, "nothing to decide" if going else "way of no mode"
-    return line(panel, view, arc.t, arc.z, color=colour, label=label, **looks)
+    looks["label"] = same or label
+    return line(panel, view, arc.t, arc.z, color=colour, **looks)
 
 
 def modes_of(task: Task, modes: Sequence[int], way: int) -> list[int]:

@@ -120,13 +120,16 @@ def note_above(panel: Axes, text: str, x: float, gap: float, coords: Any = "axes
 
 
 def legend(figure: Figure, by_label: bool = False, **looks: Any) -> None:
-    """Writes the labels of all panels below a figure, each once, in the order of drawing or sorted."""
-    entries: dict[str, Artist] = {}
+    """Writes the labels of all panels below a figure, each once, in the order of drawing or sorted.
+
+    A label of artists of several types, as of a field and a line, has them above each other.
+    """
+    entries: dict[str, dict[type[Artist], Artist]] = {}
     for panel in figure.axes:
-        artists, labels = panel.get_legend_handles_labels()
-        entries |= dict(zip(labels, artists, strict=True))
+        for artist, label in zip(*panel.get_legend_handles_labels(), strict=True):
+            entries.setdefault(label, {})[type(artist)] = artist
     order = sorted(entries, key=_in_order) if by_label else list(entries)
-    artists = [entries[label] for label in order]
+    artists: list[Any] = [tuple(entries[label].values()) for label in order]
     rows = -(-len(order) // COLUMNS)
     widths = [
         max(map(len, order[i : i + rows]), default=0) for i in range(0, len(order), rows or 1)

@@ -68,10 +68,10 @@ def check_replay(task: Task, path: Path, options: ReplayOptions) -> None:
     if options.layout not in (layouts := ("side-by-side", "overlay")):
         raise unknown("layout", options.layout, layouts)
     if not (isinstance(options.fps, Integral) and 1 <= options.fps <= 240):
-        raise BadInput(f"no video has {options.fps} frames a second: give 1 to 240")
+        raise BadInput(f"no video has {options.fps!r} frames a second: give 1 to 240")
     if not (isinstance(options.slow_motion, Real) and 1 <= options.slow_motion <= 100):
         raise BadInput(
-            f"slow motion {options.slow_motion} cannot be played: give 1 (real time) to 100"
+            f"slow motion {options.slow_motion!r} cannot be played: give 1 (real time) to 100"
         )
     size = np.asarray(options.size)
     if size.shape != (2,) or size.dtype.kind not in "iu":
