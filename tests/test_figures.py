@@ -136,6 +136,16 @@ def test_its_axes_have_labels_with_units_and_its_legend_hides_nothing(task, name
 
 
 @TASKS
+def test_the_overview_names_parts_and_end_in_the_picture(task):
+    figure = draw("overview", task)
+    assert len(figure.legends[0].get_texts()) <= 6
+    words = [text.get_text().replace("\n", " ") for text in figure.axes[0].texts]
+    for mode in (0, 1):
+        assert f"{style.set_label(mode)}, mode {task.mode_name(mode)}" in words
+    assert SHOWN[task.name].noisy.outcome.replace("_", " ") in words
+
+
+@TASKS
 @EVERY_FIGURE
 def test_a_run_without_a_critical_set_is_drawn(task, name):
     points = np.empty((0, task.chart.dimension))

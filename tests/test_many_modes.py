@@ -86,7 +86,7 @@ def test_words_do_not_lie_over_each_other(shown, name):
     figure = figures.FIGURES[name].draw(shown)
     figure.draw_without_rendering()
     words = [panel.title for panel in figure.axes if panel.axison]
-    words += figure.legends[0].get_texts()
+    words += [text for panel in figure.axes for text in panel.texts] + figure.legends[0].get_texts()
     boxes = [text.get_window_extent() for text in words if text.get_text()]
     assert len(boxes) >= 6
     assert not [pair for pair in combinations(boxes, 2) if pair[0].overlaps(pair[1])]

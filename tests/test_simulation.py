@@ -5,6 +5,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from planted import (
     ChartPolicy,
     circle_policy,
@@ -294,6 +295,24 @@ def test_a_plot_shows_every_coordinate_by_mode_and_marks_the_jumps(jumping_arc, 
         }
     assert [text.get_text() for text in figure.axes[0].get_legend().texts] == ["mode 0", "mode 1"]
     figure.savefig(tmp_path / "arc.png")
+
+
+def test_a_plot_goes_into_axes_of_the_user(jumping_arc):
+    figure = Figure()
+    axes = figure.subplots(2)
+    assert jumping_arc.plot(axes) is figure
+    assert [panel.get_ylabel() for panel in axes] == ["x [m]", "y [m]"]
+    ax = Figure().subplots()
+    assert jumping_arc.plot(ax) is ax.figure
+    assert [text.get_text() for text in ax.texts] == ["x [m]", "y [m]"]
+    for wrong in (3, [], Figure().subplots(3), [ax, None]):
+        with pytest.raises(BadInput, match=r"give one of matplotlib's Axes, or 2, as those of"):
+            jumping_arc.plot(wrong)
+
+
+def test_a_policy_has_no_mode_in_a_plot(jumping_arc):
+    figure = replace(jumping_arc, controller="policy").plot()
+    assert [text.get_text() for text in figure.axes[0].get_legend().get_texts()] == ["policy"]
 
 
 def test_a_plot_does_without_the_task(jumping_arc):
