@@ -33,6 +33,7 @@ SHORTER = {
     'hyrl_mj.run("my_robot.py")': 'hyrl_mj.run("my_robot.py", preset="smoke")',
     "eps=0.1, seed=0)": 'eps=0.1, seed=0, preset="smoke")',
     "learn(300)": "learn(110)",
+    'camera="chase")': 'camera="chase", size=(480, 160), fps=2)',
 }
 TRAINING = ("run", "robustify", "diagnose", "sweep")
 EPISODES, FRAMES, SIZE = "20", "2", "480x160"

@@ -102,6 +102,16 @@ def test_its_replay_is_shown_by_a_notebook_and_saved(run, tmp_path):
         replay.save(tmp_path / "mine.avi")
 
 
+def test_the_video_of_the_run_is_not_rendered_again(run, monkeypatch):
+    has = type(run.manifest).has
+    monkeypatch.setattr(
+        type(run.manifest), "has", lambda m, path: path.suffix == ".mp4" or has(m, path)
+    )
+    monkeypatch.setattr(notebook, "Replay", lambda render, path=None: path)
+    assert run.replay() == run.path / "replay.mp4"
+    assert run.replay(fps=10) is None
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [

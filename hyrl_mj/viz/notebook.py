@@ -38,15 +38,17 @@ class Replay:
 
     Args:
         render: writes it to a path, as `render_replay`.
+        path: an mp4 of it, if there is one.
 
     Attributes:
         content: of the mp4.
     """
 
-    def __init__(self, render: Callable[[Path], None]):
+    def __init__(self, render: Callable[[Path], None], path: Path | None = None):
         self._render = render
         with TemporaryDirectory() as folder:
-            render(path := Path(folder) / "replay.mp4")
+            if path is None:
+                render(path := Path(folder) / "replay.mp4")
             self.content = path.read_bytes()
 
     def __repr__(self) -> str:
@@ -152,11 +154,13 @@ class Run(directory.Run):
         *,
         layout: str = "side-by-side",
         camera: str | None = None,
-        size: tuple[int, int] = (960, 540),
+        size: tuple[int, int] = (1280, 720),
         fps: int = 30,
         slow_motion: float = 1.0,
     ) -> Replay:
         """Renders policy and hybrid controller under the same noise, as a video that a notebook shows.
+
+        Without arguments that is the video of the run directory, if it is there.
 
         Args:
             starts: "critical", "paper" or "latest", as of `hyrl-mj replay`, or starts (n, d) in the chart.
@@ -173,8 +177,14 @@ class Run(directory.Run):
 
         options = ReplayOptions(layout, camera, size, fps, slow_motion)
         check_replay(self.task, Path("replay.mp4"), options)
-        shows, floor = replay_shows(self, starts, noise, eps), replay_floor(self)
-        return Replay(lambda path: render_replay(self.task, shows, path, options, floor=floor))
+        shows = replay_shows(self, starts, noise, eps)
+
+        def render(path: Path) -> None:
+            render_replay(self.task, shows, path, options, floor=replay_floor(self))
+
+        own = self.path / "replay.mp4"
+        usual = (starts, noise, eps, options) == ("critical", None, None, ReplayOptions())
+        return Replay(render, own if usual and self.manifest.has(own) else None)
 
     def to_dataframe(self) -> DataFrame:
         """Returns what noise can do as a DataFrame of pandas, as `robustness_rows`.
