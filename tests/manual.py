@@ -44,6 +44,7 @@ EFFORT |= {"attack_starts": 12, "attack_rounds": 1}
 TESTED = (
     "scripts/benchmark.py",
     "scripts/fields.py",
+    "scripts/gallery.py",
     "scripts/outside_agents.py",
     "scripts/reproduce_paper.py",
     "tests/attack.py",

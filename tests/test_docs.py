@@ -6,6 +6,7 @@ import io
 import json
 import os
 import re
+import runpy
 import shlex
 import shutil
 import subprocess
@@ -59,6 +60,30 @@ def test_six_terms_come_before_the_first_table():
         "Proved, not broken",
     ):
         assert f"**{term}**" in before
+
+
+def test_the_gallery_shows_every_picture_and_these_are_small():
+    pictures = {*(MANUAL / "images").iterdir()}
+    shown = re.findall(r"\]\((images/[^)]+)\)", texts[MANUAL / "gallery.md"])
+    assert {MANUAL / name for name in shown} == pictures
+    assert all(path.stat().st_size < 400_000 for path in pictures)
+
+
+def test_the_script_of_the_gallery_draws_its_pictures(
+    planted_circle, tmp_path, monkeypatch, capsys
+):
+    script = str(ROOT / "scripts" / "gallery.py")
+    monkeypatch.setattr(sys, "argv", [script, str(planted_circle[0].path), "--out", str(tmp_path)])
+    runpy.run_path(script, run_name="__main__")
+    for picture in tmp_path.iterdir():
+        assert picture.read_bytes().startswith(b"\x89PNG")
+        assert f"images/{picture.name}" in texts[MANUAL / "gallery.md"]
+    assert len(capsys.readouterr().out.splitlines()) == len([*tmp_path.iterdir()]) == 3
+    monkeypatch.setattr(sys, "argv", [script, "nowhere"])
+    with pytest.raises(SystemExit) as end:
+        runpy.run_path(script, run_name="__main__")
+    assert end.value.code == 2
+    assert "nowhere is not a run directory" in capsys.readouterr().err
 
 
 @each_page

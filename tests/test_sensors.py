@@ -180,6 +180,7 @@ BAD = {
     "bias inf": "finite number >= 0",
     "unifrom 0.1": "Did you mean 'uniform'",
     "sensor 0.1": "unknown part of a sensor",
+    "0.1": r"names no kind: .* 'uniform 0.1', or the bound alone as eps 0.1",
     "uniform 0.1 +": "unknown part of a sensor ''",
     "uniform 1e308 + bias 1e308": r"give at most 1e\+30",
     "uniform 0.1 + quantum 1e-320": r"give numbers from 1e-30 to 1e\+30",

@@ -348,9 +348,9 @@ class Run:
     def lost(self, controller: str = "policy") -> np.ndarray:
         """Returns the starts (n, d) from which a controller is known to be lost under the noise of the run.
 
-        Where the worst-case game decides these are nodes of its lattice that may be starts. Elsewhere it is
-        the start of the strongest signal of the attack, if that is lost. `hyrl-mj simulate RUN --start ...
-        --noise worst` (or attack) plays the signal.
+        Where the worst-case game decides these are nodes of its lattice that may be starts; of losses between
+        the nodes only the share is known, from the scores. Elsewhere it is the start of the strongest signal
+        of the attack, if that is lost. `run.simulate(run.lost(), "worst")` (or "attack") plays the signals.
 
         Args:
             controller: "policy" or "hyrl".
@@ -441,7 +441,9 @@ def opened(path: str | Path, settings: Settings, policy: AnyPolicy | None = None
         if not config.exists():
             write_config(run)
         elif (run := load_run(path, policy)).settings != settings:
-            differences = "; ".join(differing(run.settings, settings))
+            found = [*differing(run.settings, settings)]
+            # Another task has other settings everywhere.
+            differences = "; ".join(found[:1] if run.settings.task != settings.task else found)
             raise BadInput(
                 f"{path} holds a run with other settings ({differences}): "
                 "choose another --out, give the same settings, or remove it"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hyrl_mj.errors import BadInput, has_controls
+from hyrl_mj.errors import BadInput, counted, has_controls
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -119,15 +119,14 @@ class Chart:
         Raises:
             BadInput: wrong shape, not finite, or outside the chart.
         """
+        wanted = f"{owner} is {counted(self.dimension, 'number')} ({', '.join(self.names)})"
         try:
             z = np.atleast_2d(np.asarray(z, dtype=float))
         except (TypeError, ValueError):
-            raise BadInput(f"a state of {owner} is {self.dimension} numbers, got {z!r}") from None
+            raise BadInput(f"a state of {wanted}, got {z!r}") from None
         if z.ndim != 2 or z.shape[1] != self.dimension or not len(z):
-            raise BadInput(
-                f"a state of {owner} is {self.dimension} number(s) ({', '.join(self.names)}), "
-                f"got shape {z.shape}"
-            )
+            got = z.shape[1] if z.ndim == 2 and len(z) else f"shape {z.shape}"
+            raise BadInput(f"a state of {wanted}, got {got}")
         bad = ~(np.isfinite(z).all(axis=1) & self.contains(z))
         if bad.any():
             axes = zip(self.names, self.units, self.low, self.high, strict=True)

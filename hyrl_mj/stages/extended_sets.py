@@ -95,7 +95,7 @@ class ExtendedSets(Saved):
             left = self.room[here & narrow].min()
             place = where(task.chart, self.points[here], narrow[here])
             yield (
-                f"between {first} and {second}, {place}, the overlap is as little as {left:.2g} {unit} wide; "
+                f"between {first} and {second}, {place}, both win in as little as {left:.2g} {unit} across; "
                 f"switching safely needs {2 * self.eps:g} {unit}"
             )
         if more := len(pairs) - len(most):
