@@ -5,6 +5,8 @@ The stages between are `find_critical_set`, `make_partition`, `extend` and `Hybr
 package needs neither torch nor a GL library.
 """
 
+from importlib.metadata import version
+
 import lazy_loader
 
 from hyrl_mj.system import gl as gl  # first: imports mujoco, with a GL backend that exists here
@@ -12,6 +14,6 @@ from hyrl_mj.system import gl as gl  # first: imports mujoco, with a GL backend 
 # isort: split
 from hyrl_mj import tasks as tasks  # which Gymnasium can make after `import hyrl_mj`
 
-__version__ = "0.1.0"
+__version__ = version("hyrl-mj")
 # The names of `__init__.pyi`, each imported when it is first used.
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -11,6 +11,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import tomllib
 
 import pytest
 import unmeasured
@@ -60,6 +61,18 @@ def test_six_terms_come_before_the_first_table():
         "Proved, not broken",
     ):
         assert f"**{term}**" in before
+
+
+def test_the_version_is_the_same_everywhere():
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    version = tomllib.loads(text)["project"]["version"]
+    (day,) = re.findall(
+        rf"^## \[{re.escape(version)}\] - (\d{{4}}-\d\d-\d\d)$",
+        (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"),
+        re.MULTILINE,
+    )
+    cited = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert f"\nversion: {version}\ndate-released: {day}\n" in cited
 
 
 def test_the_gallery_shows_every_picture_and_these_are_small():

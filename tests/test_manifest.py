@@ -7,6 +7,7 @@ import threading
 
 import pytest
 
+import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput
 from hyrl_mj.files import artifacts, manifest
 from hyrl_mj.files.manifest import (
@@ -100,6 +101,7 @@ def test_other_settings_or_code_make_a_stage_undone(folder):
 def test_another_version_runs_every_stage_again_and_can_read_what_is_there(folder, monkeypatch):
     monkeypatch.setattr(manifest, "version", lambda name: "0.0.9")
     assert done(folder) == []
+    assert Manifest(folder, SETTINGS).other_versions == [hyrl_mj.__version__]
     assert Manifest(folder, SETTINGS).checked(folder / "partition.npz") == folder / "partition.npz"
     write(folder, "train", "policy.json", "a")
     assert done(folder) == ["train"]

@@ -74,6 +74,9 @@ class Verdict:
     sentence: str
     reasons: tuple[str, ...]
 
+    def __repr__(self) -> str:
+        return f"Verdict({self})"
+
     def __str__(self) -> str:
         return f"{self.word}: {self.sentence}"
 

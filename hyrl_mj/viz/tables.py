@@ -188,8 +188,8 @@ def robustness_rows(robustness: Robustness) -> list[dict[str, Any]]:
 
     A row has the kind of noise ("worst" is the worst-case game), its bound `eps`, the controller, the share
     that is `lost`, and where starts were drawn the 95% interval of the share, `lost_low` to `lost_high`, and
-    how many `runs` there were. Episodes have a row for each region of `starts`. Rows of the game have the
-    fields of `Score`, too, whose shares are of the winnable starts.
+    how many `runs` there were. Episodes have a row for each region of `starts`. Under attack the share is of
+    the starts that are won without noise, and in the game of the winnable ones, as are all fields of `Score`.
     """
     rows: list[dict[str, Any]] = []
     for who, level in robustness.game.scores.items() if robustness.game else ():
