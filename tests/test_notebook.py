@@ -91,7 +91,7 @@ def test_episodes_and_attacks_are_rows_of_the_table():
 
 @needs_gl
 def test_its_replay_is_shown_by_a_notebook_and_saved(run, tmp_path):
-    replay = run.replay([[3.0], [3.2]], "uniform", size=(480, 160), fps=1)
+    replay = run.replay(np.array([[3.0], [3.2]]), "uniform", size=(480, 160), fps=1)
     page = replay._repr_html_()
     assert page.startswith("<video")
     assert b64decode(page.split("base64,")[1].split('"')[0]) == replay.content

@@ -183,7 +183,8 @@ class Run(directory.Run):
             render_replay(self.task, shows, path, options, floor=replay_floor(self))
 
         own = self.path / "replay.mp4"
-        usual = (starts, noise, eps, options) == ("critical", None, None, ReplayOptions())
+        usual = isinstance(starts, str) and starts == "critical" and noise is eps is None
+        usual = usual and options == ReplayOptions()
         return Replay(render, own if usual and self.manifest.has(own) else None)
 
     def to_dataframe(self) -> DataFrame:
