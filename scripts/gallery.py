@@ -21,8 +21,8 @@ FIGURES = {
     "vectors": hyrl_mj.vector_field,
     "robustness": lambda run: run.plot("robustness_map"),
 }
-# Wide enough for a page of the manual, and a tenth of the bytes of the figures of a run.
-DPI, COLOURS = 90, 64
+# Wide enough for a page of the manual, and a quarter of the bytes of the figures of a run.
+DPI, COLOURS = 90, 256
 
 
 def main() -> None:
@@ -39,7 +39,11 @@ def main() -> None:
                 picture = BytesIO()
                 draw(run).savefig(picture, format="png", dpi=DPI, bbox_inches="tight")
                 with artifacts.replacing(out) as temporary:
-                    small = Image.open(picture).convert("RGB").quantize(COLOURS)
+                    small = (
+                        Image.open(picture)
+                        .convert("RGB")
+                        .quantize(COLOURS, Image.Quantize.FASTOCTREE)
+                    )
                     small.save(temporary, format="png", optimize=True)
                 print(out)
     except HyrlError as error:
