@@ -249,7 +249,7 @@ def test_bad_input_before_anything_is_made(arguments, parts, tmp_path):
     ("arguments", "parts"),
     [
         (["simulate", "--start", "nan"], ["theta = nan"]),
-        (["simulate", "--start", "1", "2"], ["theta", "shape"]),
+        (["simulate", "--start", "1", "2"], ["theta", "got 2"]),
         (["simulate", "--start", "1", "--q0", "5"], ["mode 5", "(0, 1)"]),
         (["simulate", "--start", "1", "--noise", "white"], ["'white'", "uniform"]),
         (["simulate", "--start", "1", "--time", "0"], ["horizon 0", "> 0"]),

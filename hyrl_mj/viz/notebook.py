@@ -166,7 +166,11 @@ class Run(directory.Run):
             starts: "critical", "paper" or "latest", as of `hyrl-mj replay`, or starts (n, d) in the chart.
             noise: as of `simulate`; by default that of the arcs on disk, and alternating from given starts.
             eps: bound of the noise, by default the run's.
-            layout, camera, size, fps, slow_motion: as of `ReplayOptions`.
+            layout: side-by-side, or overlay (both controllers in one scene).
+            camera: a camera of the MJCF, by default the scene's.
+            size: width and height [pixels], even numbers.
+            fps: frames per second.
+            slow_motion: how many times slower the video is around jumps.
 
         Raises:
             BadInput: a value that cannot be used.
