@@ -129,10 +129,10 @@ def ranges(chart: Chart, points: np.ndarray, resolution: float) -> str:
     """
     points = points.copy()
     for i in np.flatnonzero(chart.periodic):
-        turn, ends = chart.sides[i], np.sort(points[:, i])
-        gaps = np.diff(ends, append=ends[0] + turn)
+        turn, along = chart.sides[i], np.sort(points[:, i])
+        gaps = np.diff(along, append=along[0] + turn)
         if gaps.max() > gaps[-1] + resolution:
-            begin = ends[gaps.argmax() + 1]
+            begin = along[gaps.argmax() + 1]
             points[:, i] = begin + (points[:, i] - begin) % turn
     ends = zip(chart.names, chart.units, points.min(axis=0), points.max(axis=0), strict=True)
     fine = resolution / 100 or 1e-12  # what is hardly off 0 is 0

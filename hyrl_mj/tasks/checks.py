@@ -174,7 +174,7 @@ def hidden_goal(task: Task, eps: float, everywhere: bool = False) -> str:
         for share in NEARER:  # of the chart's sides
             goal = z[task.miss(z).argmin()]
             z = np.vstack([goal, goal + share * chart.sides * box])
-
+    goal = np.asarray(goal)
     plant = task.plant(len(box))
     u = np.where(rng.random((len(box), len(task.inputs))) < 0.5, *task.input_limits)
 
