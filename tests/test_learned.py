@@ -47,11 +47,13 @@ def test_a_run_stops_where_stage_1_has_not_learned_unless_told_to_go_on(
     assert after[0] == "critical-set"
 
 
-@pytest.mark.parametrize(("minutes", "trainings"), [(60, 2), (1e-9, 1)])
+@pytest.mark.parametrize(
+    ("minutes", "before", "trainings"), [(60, 0, 2), (60, 800, 2), (60, 990, 1), (1e-9, 0, 1)]
+)
 def test_another_attempt_is_paid_for_the_way_to_the_goal_if_there_is_time(
-    minutes, trainings, quickly_judged, tmp_path, monkeypatch
+    minutes, before, trainings, quickly_judged, tmp_path, monkeypatch
 ):
-    """The first training gives a policy that never arrives, the second is what it is without training."""
+    """The first training gives a policy that is known, the second is what it is without training."""
     train, given = training.train, []
 
     def planted(task, settings, seed, **more):
@@ -61,7 +63,7 @@ def test_another_attempt_is_paid_for_the_way_to_the_goal_if_there_is_time(
         return policy if len(given) > 1 else MlpPolicy(task, "ppo", policy.activation, weights)
 
     def measured(task, policy):
-        return Arrivals(900 if any(w.any() for w in policy.weights.values()) else 0, 0, 1_000)
+        return Arrivals(900 if any(w.any() for w in policy.weights.values()) else before, 0, 1_000)
 
     monkeypatch.setattr(training, "train", planted)
     monkeypatch.setattr(Arrivals, "measure", measured)
@@ -73,16 +75,14 @@ def test_another_attempt_is_paid_for_the_way_to_the_goal_if_there_is_time(
     with opened(tmp_path / "run", settings) as run:
         found = run_stage(run, "train", said.append).arrivals
     again = trainings == 2
-    assert (found.trainings, found.arrived) == (trainings, 900 if again else 0)
+    assert (found.trainings, found.arrived) == (trainings, 900 if again else before)
     assert found.shaped == again, "which the trainings of the modes follow"
     first, *later = given
     assert first == (False, settings.stage1.samples, 0.4, 0)
     assert [attempt[:3] for attempt in later] == [(True, *first[1:3])] * (trainings - 1)
-    told = (
-        "which may take 1e-09: more"
-        if trainings == 1
-        else "arrives from 0 of 1,000 .* another training"
-    )
+    told = f"arrives from {before} of 1,000 .* another training"
+    if not again:
+        told = "arrives from 990 of 1,000 " if before else "which may take 1e-09: more"
     assert any(re.search(told, line) for line in said)
 
 

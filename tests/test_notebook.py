@@ -100,6 +100,8 @@ def test_its_replay_is_shown_by_a_notebook_and_saved(run, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.gif", "mine.png"]
     with pytest.raises(BadInput, match="give a name that ends in one of"):
         replay.save(tmp_path / "mine.avi")
+    with pytest.raises(BadInput, match="3 is no file: give its path"):
+        replay.save(3)
 
 
 def test_the_video_of_the_run_is_not_rendered_again(run, monkeypatch):

@@ -8,6 +8,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from hyrl_mj.files import artifacts
+from hyrl_mj.judging.game import NEARLY
 from hyrl_mj.policies import Policy, PolicyController
 from hyrl_mj.simulation import LoopSettings, Rollout, closed_loop, simulate
 from hyrl_mj.tasks import Outcome, Task
@@ -46,6 +47,11 @@ class Arrivals(artifacts.SavedAsJson):
     def most(self) -> bool:
         """Whether it arrives from at least half of the starts."""
         return 2 * self.arrived >= self.episodes
+
+    @property
+    def nearly_all(self) -> bool:
+        """Whether it arrives from nearly all of the starts, as a verdict asks."""
+        return self.arrived >= NEARLY * self.episodes
 
     @staticmethod
     def measure(task: Task, policy: Policy) -> Arrivals:

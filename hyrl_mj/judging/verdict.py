@@ -302,7 +302,7 @@ class _Case:
 
     def weaknesses(self) -> Iterator[str]:
         """Yields why the run is WEAK, if it is."""
-        if self.arrivals.arrived < NEARLY * self.arrivals.episodes:
+        if not self.arrivals.nearly_all:
             yield f"the policy {self.arrivals}"
         policy, hyrl = (success_rates(self.robustness, who)[1] for who in NAMES)
         if policy is not None and hyrl is not None and policy < hyrl < 1 and self.better:

@@ -61,8 +61,8 @@ class RunOptions:
         all_coordinates: noise on every coordinate of the measurement, not only on the noisy ones of the task.
         go_on: go on also where the policy of stage 1 arrives from less than half of its starts, so that the
             other stages divide what it has not learned; preset smoke always goes on.
-        stage1_minutes: where the policy of stage 1 arrives from less than half of its starts, it is trained
-            again, paid for being near to the goal, if stage 1 takes no more minutes; by default 10.
+        stage1_minutes: where the policy of stage 1 does not arrive from nearly all of its starts, it is
+            trained again, paid for being near to the goal, if stage 1 takes no more minutes; by default 10.
         set: settings to change, as they stand in config.json, such as stage1.samples=300000; by default none.
         out: the run directory; by default runs/TASK.
     """

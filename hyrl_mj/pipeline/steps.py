@@ -80,7 +80,7 @@ def train_stage(run: Run, say: Say) -> None:
 
 
 def _first_policy(run: Run, settings: Training, say: Say) -> tuple[MlpPolicy, Arrivals]:
-    """Trains the policy of stage 1 until it arrives from most starts, as often as the settings allow."""
+    """Trains the policy of stage 1 until it arrives from nearly all starts, as often as settings allow."""
     from hyrl_mj.learning.to_go import NoWay
     from hyrl_mj.learning.training import train
 
@@ -89,7 +89,7 @@ def _first_policy(run: Run, settings: Training, say: Say) -> tuple[MlpPolicy, Ar
     found = Arrivals.measure(run.task, policy)
     arrivals = replace(found, trainings=1, shaped=settings.shaped)
     for number in range(1, settings.attempts):
-        if arrivals.most:
+        if arrivals.nearly_all or (number > 1 and arrivals.most):
             break
         again = settings.attempt(number)
         spent = (time.monotonic() - began) / 60

@@ -66,6 +66,8 @@ class Replay:
         Raises:
             BadInput: the path has another suffix, or cannot be written.
         """
+        if not isinstance(path, str | Path):
+            raise BadInput(f"{path!r:.80} is no file: give its path, as replay.mp4")
         self._render(Path(path))
 
 
