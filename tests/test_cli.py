@@ -290,7 +290,7 @@ def test_other_settings_do_not_overwrite_a_run(finished):
     assert_one_sentence(done, "seed: 0 there, 7 given")
     done = call("run", "unit_circle", *SMOKE, "--eps", "0.2", "--out", finished[0])
     assert_one_sentence(done, "eps: 0.1 there, 0.2 given")
-    done = call("run", "vehicle", *SMOKE, "--out", finished[0])
+    done = call("run", "vehicle", "--preset", "smoke", "--out", finished[0])
     assert_one_sentence(done, "other settings (task: unit_circle there, vehicle given): choose")
 
 
