@@ -219,7 +219,7 @@ def test_where_the_overlap_cannot_be_wide_enough_the_run_says_so(sized, vehicle)
     assert narrow[:, 0].max() == pytest.approx(LAST_CHANCE, abs=2 * cell)
     np.testing.assert_allclose(room, LAST_CHANCE - narrow[:, 0], atol=2 * cell)
     sentence = sized[0.1].sentence(vehicle)
-    assert "between 0 (left) and 1 (right), from x = 0.3 m on, both win in as" in sentence
+    assert "between 0 (left) and 1 (right), from x = 0.3 m on, the room in which both" in sentence
     assert "switching safely needs 0.2 m" in sentence
     assert "switching" not in sized[0.0].sentence(vehicle)
 

@@ -101,7 +101,9 @@ def test_other_settings_or_code_make_a_stage_undone(folder):
 def test_another_version_runs_every_stage_again_and_can_read_what_is_there(folder, monkeypatch):
     monkeypatch.setattr(manifest, "version", lambda name: "0.0.9")
     assert done(folder) == []
-    assert Manifest(folder, SETTINGS).other_versions == [hyrl_mj.__version__]
+    others = Manifest(folder, SETTINGS).other_versions
+    assert others(["train"]) == [hyrl_mj.__version__]
+    assert others(["simulate --start"]) == [], "which no run makes again"
     assert Manifest(folder, SETTINGS).checked(folder / "partition.npz") == folder / "partition.npz"
     write(folder, "train", "policy.json", "a")
     assert done(folder) == ["train"]

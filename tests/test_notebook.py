@@ -29,7 +29,7 @@ def test_it_lists_what_is_there_and_says_so(run):
 
 
 def test_what_a_run_holds_shows_itself_in_one_line(run):
-    for name in ("agent", *notebook.ATTRIBUTES):
+    for name in notebook.ATTRIBUTES:
         assert "\n" not in repr(getattr(run, name)), name
     assert repr(run.controller) == "HybridController(unit_circle, modes 0, 1)"
 
@@ -86,7 +86,10 @@ def test_episodes_and_attacks_are_rows_of_the_table():
     one, other = robustness_rows(SimpleNamespace(game=None, episodes=[episode], attacks=[attack]))
     assert (one["lost"], one["runs"], one["starts"]) == (0.25, 8, "near M*")
     np.testing.assert_allclose((one["lost_low"], one["lost_high"]), (0.1, 0.6))
-    assert (other["noise"], other["lost"], other["runs"]) == ("attack", 0.25, 7)
+    assert (other["noise"], other["lost"], other["runs"]) == ("attack", 0.25, 20)
+    never = SimpleNamespace(**(vars(attack) | {"attacked": 0, "lost": 0}))
+    (row,) = robustness_rows(SimpleNamespace(game=None, episodes=[], attacks=[never]))
+    assert np.isnan(row["lost"]), "what never arrives is not called unbroken"
 
 
 @needs_gl
@@ -118,6 +121,9 @@ def test_the_video_of_the_run_is_not_rendered_again(run, monkeypatch):
     ("call", "message"),
     [
         (lambda run: run.plot("x"), "unknown figure 'x': choose one of overview, "),
+        (lambda run: run.plot(["overview"]), "unknown figure .*: choose one of overview, "),
+        (lambda run: run.simulate(np.empty((0, 1))), "no start is given"),
+        (lambda run: run.replay(size=((1,), (2, 3))), "size .* cannot be used"),
         (lambda run: run.simulate([3.0, 1.0]), "a state of unit_circle is 1 number"),
         (lambda run: run.simulate([3.0], 3), "noise 3 cannot be used"),
         (lambda run: run.simulate([3.0], Noise(), eps=1), "tells its own bounds: leave eps out"),

@@ -313,6 +313,7 @@ def test_a_plot_goes_into_axes_of_the_user(jumping_arc):
 def test_a_policy_has_no_mode_in_a_plot(jumping_arc):
     figure = replace(jumping_arc, controller="policy").plot()
     assert [text.get_text() for text in figure.axes[0].get_legend().get_texts()] == ["policy"]
+    assert {line.get_color() for line in figure.axes[0].get_lines()[:2]} == {"0.2"}
 
 
 def test_a_plot_does_without_the_task(jumping_arc):
@@ -368,7 +369,7 @@ def test_two_controllers_meet_the_same_noise(vehicle):
         ({"horizon": np.inf}, "horizon inf s .*time > 0"),
         ({"z0": [0.0, 2.0]}, r"y = 2 m\) is outside vehicle"),
         ({"z0": np.zeros(3)}, "vehicle is 2 number"),
-        ({"z0": np.zeros((0, 2))}, r"got shape \(0, 2\)"),
+        ({"z0": np.zeros((0, 2))}, "no start is given"),
         ({"q0": 2}, r"mode 2 is unknown: choose one of \(0, 1\)"),
         ({"q0": 0.5}, r"mode 0.5 is unknown: choose one of \(0, 1\)"),
         ({"z0": np.zeros((3, 2)), "q0": np.array([0, 1])}, r"\(2,\)"),

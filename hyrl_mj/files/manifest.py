@@ -146,10 +146,13 @@ class Manifest:
             return False
         return not any(self._doubt(name, entries) for name in entry.outputs)
 
-    @property
-    def other_versions(self) -> list[str]:
-        """The other versions of this package that have made stages, which `is_done` does not count."""
-        return sorted({e.version for e in self._entries().values()} - {version("hyrl-mj")})
+    def other_versions(self, stages: Collection[str]) -> list[str]:
+        """Returns the other versions of this package that have made some of these stages.
+
+        Such stages are not done, as `is_done` says.
+        """
+        made = {e.version for name, e in self._entries().items() if name in stages}
+        return sorted(made - {version("hyrl-mj")})
 
     def _size(self, name: str) -> int:
         """Returns the size of a file [bytes]; 0 if it is missing."""

@@ -184,9 +184,9 @@ class Training(Checked):
         shaped: whether episodes are paid for being near to the goal by the shortest way around what ends
             them, in place of the task's reward (stage 1 only; those of the modes follow it).
         attempts: number of trainings, each with another seed, until a policy is good enough; the best policy
-            is kept. In stage 1 it is if it arrives from 99% of the starts, or after two attempts from half of
-            them. All but the first are `shaped` there, the third and later ones with twice the samples and
-            widths.
+            is kept. In stage 1 it is good enough if it arrives from 99% of the starts, or after two attempts
+            from half of them. All but the first are `shaped` there, the third and later ones with twice the
+            samples and widths.
         minutes: no further attempt begins if it would end later than so many minutes after the first began
             (stage 1 only).
         action_noise: standard deviation of the exploration noise of TD3 and DDPG on inputs scaled to -1..1.

@@ -249,8 +249,8 @@ def _run_all(
     run: directory.Run, say: Say, stages: Collection[str] = STAGES, learned: bool = False
 ) -> Run:
     """Runs the stages that are not done; those after the first only if it has `learned`, if that is asked."""
-    if others := run.manifest.other_versions:
-        say(f"the stages that hyrl-mj {' and '.join(others)} has made are run again")
+    if others := run.manifest.other_versions(stages):
+        say(f"the stages that hyrl-mj {' and '.join(others)} made are run again")
     if not run.manifest.is_done("critical-set"):
         judge_task(run.task)
         try_elsewhere(run.task)

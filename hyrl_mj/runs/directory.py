@@ -350,7 +350,8 @@ class Run:
 
         Where the worst-case game decides these are nodes of its lattice that may be starts; of losses between
         the nodes only the share is known, from the scores. Elsewhere it is the start of the strongest signal
-        of the attack, if that is lost. `run.simulate(run.lost(), "worst")` (or "attack") plays the signals.
+        of the attack, if that is lost. `run.simulate(run.lost(), "worst")` plays the signals of the game, and
+        "attack" in its place searches again.
 
         Args:
             controller: "policy" or "hyrl".

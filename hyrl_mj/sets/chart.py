@@ -124,6 +124,8 @@ class Chart:
             z = np.atleast_2d(np.asarray(z, dtype=float))
         except (TypeError, ValueError):
             raise BadInput(f"a state of {wanted}, got {z!r}") from None
+        if z.size == 0:
+            raise BadInput(f"no start is given: a state of {wanted}")
         if z.ndim != 2 or z.shape[1] != self.dimension or not len(z):
             got = z.shape[1] if z.ndim == 2 and len(z) else f"shape {z.shape}"
             raise BadInput(f"a state of {wanted}, got {got}")

@@ -128,8 +128,9 @@ class HybridArc(Saved):
             panel = panels[i % len(panels)]
             for rows in flows:
                 mode = self.q[rows[0]]
-                name = "policy" if self.controller == "policy" else f"mode {mode}"
-                panel.plot(self.t[rows], z[rows], color=f"C{mode}", label=name)
+                alone = self.controller == "policy"
+                name, colour = ("policy", "0.2") if alone else (f"mode {mode}", f"C{mode}")
+                panel.plot(self.t[rows], z[rows], color=colour, label=name)
             for t in self.t[jumps]:
                 panel.axvline(t, color="0.6", linestyle="--", linewidth=0.8, zorder=0)
             if len(panels) < len(labels):
@@ -141,7 +142,7 @@ class HybridArc(Saved):
         lines, names = panels[0].get_legend_handles_labels()
         by_label = dict(zip(names, lines, strict=True))
         panels[0].legend(by_label.values(), by_label)
-        return panels[0].get_figure(root=True)
+        return panels[0].figure
 
     def _axis_labels(self) -> list[str]:
         """Returns "x [m]" for each coordinate, or "z[0]" if the task is not registered."""

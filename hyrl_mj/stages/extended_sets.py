@@ -95,8 +95,8 @@ class ExtendedSets(Saved):
             left = self.room[here & narrow].min()
             place = where(task.chart, self.points[here], narrow[here])
             yield (
-                f"between {first} and {second}, {place}, both win in as little as {left:.2g} {unit} across; "
-                f"switching safely needs {2 * self.eps:g} {unit}"
+                f"between {first} and {second}, {place}, the room in which both win is only {left:.2g} "
+                f"{unit} wide; switching safely needs {2 * self.eps:g} {unit}"
             )
         if more := len(pairs) - len(most):
             yield f"so it is in places between {counted(more, 'other pair')} of modes"
@@ -292,11 +292,11 @@ def runs_from_outside(
             wins[outside] &= ~_astray(partition, part, arrives, rows[outside], rollout)
         if rim is not None:
             entry[outside] = _entries(part, rim, rollout, longest)
-    inside = part.eroded(part.grid.cell)
     for u in () if held is None else held:
         lost = outside[~wins[outside]]
         if not len(lost):
             break
+        inside = part.eroded(part.grid.cell)
         starts = part.grid.nodes[rows[lost]]
         rollout = policy_runs(
             task, _Entering(pi, inside, u), starts, label="extended sets, held inputs"
@@ -311,7 +311,7 @@ def runs_from_outside(
 
 @dataclass(frozen=True)
 class _Entering:
-    """Holds inputs u (m,) until the robot is `inside` M_i, where the stage-1 policy goes on its way.
+    """Holds inputs u (m,) where the robot is not `inside` M_i, and goes on as the stage-1 policy there.
 
     pi_i would go on as at the nearest point at which that policy has decided, which with inertia may be far.
     """

@@ -72,12 +72,11 @@ class Replay:
 
 
 class Run(directory.Run):
-    """A run directory, whose files are read when needed; see also what it shows itself in a notebook.
+    """A run directory, whose files are read when needed; `dir` lists what it has.
 
     Attributes:
         path: the directory.
         settings: every setting of the run.
-        function: the agent, if it is a function, which no file can hold.
     """
 
     @classmethod
@@ -90,10 +89,12 @@ class Run(directory.Run):
     def __dir__(self) -> list[str]:
         return [*ATTRIBUTES]
 
-    def __getattr__(self, name: str) -> Any:
-        if hasattr(type(self), name):  # a property that could not find something else
-            return object.__getattribute__(self, name)
-        raise AttributeError(unknown("attribute of a run", name, ATTRIBUTES))
+    if not TYPE_CHECKING:  # which knows the attributes by itself
+
+        def __getattr__(self, name: str) -> Any:
+            if hasattr(type(self), name):  # a property that could not find something else: say what
+                return object.__getattribute__(self, name)
+            raise AttributeError(unknown("attribute of a run", name, ATTRIBUTES))
 
     def plot(self, figure: str = "overview") -> Figure:
         """Draws a figure of the run.
@@ -102,11 +103,12 @@ class Run(directory.Run):
             figure: overview, policy, extended_sets, robustness_map, robustness_curve or runs.
 
         Raises:
-            BadInput: there is no such figure, its stages have not run, or the chart cannot be drawn so.
+            BadInput: there is no such figure, or the chart cannot be drawn so.
+            BadArtifact: its stages, or for all but the robustness the replays, have not run.
         """
         from hyrl_mj.viz.figures import FIGURES, ShownGame, shown_game, shown_run
 
-        if figure not in FIGURES:
+        if figure not in [*FIGURES]:
             raise unknown("figure", figure, FIGURES)
         if FIGURES[figure].shows is not ShownGame:
             return FIGURES[figure].draw(shown_run(self))
@@ -181,6 +183,7 @@ class Run(directory.Run):
         from hyrl_mj.viz.replay import check_replay, render_replay
         from hyrl_mj.viz.shows import replay_floor, replay_shows
 
+        size = tuple(size) if isinstance(size, list) else size
         options = ReplayOptions(layout, camera, size, fps, slow_motion)
         check_replay(self.task, Path("replay.mp4"), options)
         shows = replay_shows(self, starts, noise, eps)

@@ -186,10 +186,11 @@ def robustness_tables(task: Task, robustness: Robustness) -> list[Table]:
 def robustness_rows(robustness: Robustness) -> list[dict[str, Any]]:
     """Returns what noise can do in numbers: a row for each kind of noise, its bound, and each controller.
 
-    A row has the kind of noise ("worst" is the worst-case game), its bound `eps`, the controller, the share
-    that is `lost`, and where starts were drawn the 95% interval of the share, `lost_low` to `lost_high`, and
-    how many `runs` there were. Episodes have a row for each region of `starts`. Under attack the share is of
-    the starts that are won without noise, and in the game of the winnable ones, as are all fields of `Score`.
+    A row has the kind of noise ("worst" is the worst-case game), its bound `eps`, the controller ("limit" is
+    the best that is possible in the game), the share that is `lost`, and where starts were drawn the 95%
+    interval of the share, `lost_low` to `lost_high`, and of how many `runs` it is the share. Episodes have a
+    row for each region of `starts`. Under attack the share is of the starts that are won without noise, NaN
+    if there are none, and in the game of the winnable ones, as are all fields of `Score`.
     """
     rows: list[dict[str, Any]] = []
     for who, level in robustness.game.scores.items() if robustness.game else ():
@@ -198,14 +199,16 @@ def robustness_rows(robustness: Robustness) -> list[dict[str, Any]]:
             rows.append(row | vars(score))
     for e in robustness.episodes:
         low, high = (1 - share for share in reversed(e.interval))
-        row = {"noise": e.noise, "controller": e.controller, "lost": 1 - e.reached, "eps": e.eps}
+        row = {"noise": e.noise, "controller": e.controller, "lost": 1 - e.reached}
+        row["eps"] = 0.0 if e.noise == NO_NOISE else e.eps
         rows.append(
             row | {"lost_low": low, "lost_high": high, "runs": e.episodes, "starts": e.region}
         )
     for a in robustness.attacks:
         low, high = a.interval
-        row = {"noise": "attack", "controller": a.controller, "lost": a.lost / max(a.attacked, 1)}
-        row |= {"eps": a.eps, "lost_low": low, "lost_high": high, "runs": sum(a.tried.values())}
+        lost = a.lost / a.attacked if a.attacked else np.nan
+        row = {"noise": "attack", "controller": a.controller, "lost": lost, "eps": a.eps}
+        row |= {"lost_low": low, "lost_high": high, "runs": a.attacked}
         rows.append(row)
     return rows
 

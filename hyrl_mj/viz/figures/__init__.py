@@ -61,8 +61,8 @@ FIGURES = {
         ShownPolicy,
         "Where the stage-1 policy goes without noise, in the colour of the mode whose way it is, and "
         "where measurement noise leads it from one start. The red field is all that it can observe along "
-        "that path, and the dots are what it does. A field of another colour is held by the part of one mode "
-        "alone.",
+        "that path, and the dots are what it does observe. Of the other colours, each is the part of one "
+        "mode alone.",
     ),
     "policy": Entry(
         draw_policy_map,

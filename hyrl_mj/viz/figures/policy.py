@@ -28,7 +28,7 @@ MAP = 240
 # Words are about three times as wide as high: how far off they keep from what is drawn, along x and y.
 LABEL = np.array([3.0, 1.0])
 RIM = 0.88  # the radius of words on a ring, outside most runs
-NOISELESS = "without noise, coloured by its mode, if it has one"
+NOISELESS = "policy without noise, in the colour of the mode it follows"
 ENDS = {
     Outcome.RUNNING: OPEN,
     Outcome.REACHED: PALE,
@@ -136,11 +136,11 @@ def _spirals(panel: Axes, shown: ShownPolicy) -> None:
     charts.spokes(panel, task.chart, shown.critical.points, CORE - 0.06)
     owners = _owners(partition)
     for i, mode in enumerate(partition.modes):
-        # In the middle of the part, whatever node the period begins with.
-        x, y = charts.on_ring(task.chart, partition.grid.nodes[owners == i, 0])
-        if len(x):
-            middle = np.array([x.mean(), y.mean()])
-            charts.words(panel, _part_label(task, mode), *(RIM * middle / np.linalg.norm(middle)))
+        # Where it is farthest to the other parts.
+        if (own := owners == i).any():
+            at = partition.grid.nodes[GridSet.from_mask(partition.grid, own).values.argmin()]
+            x, y = np.ravel(charts.on_ring(task.chart, at))
+            charts.words(panel, _part_label(task, mode), RIM * x, RIM * y)
 
 
 def _noiseless_runs(panel: Axes, shown: ShownPolicy, view: View) -> None:

@@ -7,8 +7,6 @@ from itertools import chain
 from numbers import Integral, Real
 from pathlib import Path
 
-import numpy as np
-
 from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.files import artifacts
 from hyrl_mj.physics import mjcf
@@ -73,8 +71,8 @@ def check_replay(task: Task, path: Path, options: ReplayOptions) -> None:
         raise BadInput(
             f"slow motion {options.slow_motion!r} cannot be played: give 1 (real time) to 100"
         )
-    size = np.asarray(options.size)
-    if size.shape != (2,) or size.dtype.kind not in "iu":
+    pair = isinstance(options.size, tuple) and len(options.size) == 2
+    if not pair or not all(isinstance(side, Integral) for side in options.size):
         raise BadInput(f"size {options.size!r} cannot be used: give width and height [pixels]")
     camera = options.camera or task.scene.camera
     mjcf.camera_of(task.model, camera)
