@@ -126,8 +126,8 @@ class Chart:
             raise BadInput(f"a state of {wanted}, got {z!r}") from None
         if z.size == 0:
             raise BadInput(f"no start is given: a state of {wanted}")
-        if z.ndim != 2 or z.shape[1] != self.dimension or not len(z):
-            got = z.shape[1] if z.ndim == 2 and len(z) else f"shape {z.shape}"
+        if z.ndim != 2 or z.shape[1] != self.dimension:
+            got = z.shape[1] if z.ndim == 2 else f"shape {z.shape}"
             raise BadInput(f"a state of {wanted}, got {got}")
         bad = ~(np.isfinite(z).all(axis=1) & self.contains(z))
         if bad.any():

@@ -185,7 +185,7 @@ class Part:
             if kind not in ("none", SENSOR) and not noise_class(kind).needs_controller
         ]
         if word not in (words := [*words, DELAY, HOLD, QUANTUM]):
-            if re.fullmatch(r"-?[\d.]+(e-?\d+)?", word):
+            if re.fullmatch(r"[\d.]+(e-?\d+)?", word):
                 raise BadInput(
                     f"the noise {text.strip()!r} names no kind: give one before the bound, as in "
                     f"'uniform {word}', or the bound alone as eps {word}"

@@ -292,11 +292,11 @@ def runs_from_outside(
             wins[outside] &= ~_astray(partition, part, arrives, rows[outside], rollout)
         if rim is not None:
             entry[outside] = _entries(part, rim, rollout, longest)
+    inside = part.eroded(part.grid.cell)
     for u in () if held is None else held:
         lost = outside[~wins[outside]]
         if not len(lost):
             break
-        inside = part.eroded(part.grid.cell)
         starts = part.grid.nodes[rows[lost]]
         rollout = policy_runs(
             task, _Entering(pi, inside, u), starts, label="extended sets, held inputs"

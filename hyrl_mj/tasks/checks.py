@@ -180,7 +180,7 @@ def hidden_goal(task: Task, eps: float, everywhere: bool = False) -> str:
 
     def farthest(bound: float, moves: bool = True) -> float:
         z = chart.wrap(goal + bound * noise * box)
-        if moves:  # from rest, as a robot that was there
+        if moves:  # from the state in which a robot is put there, with inertia at rest
             plant.set_state(*task.state(z))
             plant.step(u)
             z = task.z(plant.measurement)
