@@ -141,14 +141,9 @@ def drive(
     return Drives(task, bounds, arcs, attacked)
 
 
-def ending(task: Driving, arc: HybridArc) -> str:
+def ending(arc: HybridArc) -> str:
     """Returns how a run ended: "arrived", "waited" near a goal that a post stood on, "crashed", "stalled"."""
-    if arc.outcome == "reached":
-        return "arrived"
-    last = task.measured_at(arc.z[-1:, :3], arc.t[-1:], np.zeros(1, dtype=int))
-    if arc.outcome == "stalled" and task.waits(last)[0]:
-        return "waited"
-    return arc.outcome.replace("_", " ")
+    return "arrived" if arc.outcome == "reached" else arc.outcome.replace("_", " ")
 
 
 def changes(arc: HybridArc) -> int:
@@ -184,7 +179,7 @@ def _clearances(task: Driving, arc: HybridArc) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _checked(task: Driving, arcs: Iterable[HybridArc]) -> list[HybridArc]:
-    """Returns arcs that crash where the robot touches a post between two samples."""
+    """Returns arcs that crash where a post is touched between two samples, or that waited in the end."""
     checked = []
     for arc in arcs:
         times, clearances = _clearances(task, arc)
@@ -196,6 +191,9 @@ def _checked(task: Driving, arcs: Iterable[HybridArc]) -> list[HybridArc]:
             rows = {name: getattr(arc, name)[:end].copy() for name in names}
             rows["measured"][-1] = rows["u"][-1] = np.nan
             arc = replace(arc, outcome="crashed", **rows)
+        last = task.measured_at(arc.z[-1:, :3], arc.t[-1:], np.zeros(1, dtype=int))
+        if arc.outcome == "stalled" and task.waits(last)[0]:
+            arc = replace(arc, outcome="waited")
         checked.append(arc)
     return checked
 

@@ -38,7 +38,7 @@ def _table(drives: Drives, arcs: Mapping[str, Sequence[HybridArc]], title: str) 
         x, y, heading = hyrl.z[0]
         row = [f"{number}", f"{x:.2f} m, {y:.2f} m, {heading:.2f} rad"]
         for arc in (policy, hyrl):
-            row += [f"{ending(task, arc)} {arc.t[-1]:.2f} s", f"{least_clearance(task, arc):.2f} m"]
+            row += [f"{ending(arc)} {arc.t[-1]:.2f} s", f"{least_clearance(task, arc):.2f} m"]
         rows.append([*row, f"{changes(hyrl)}"])
     both = [title for name in SHOWN for title in (NAMES[name], "least clearance")]
     return Table(title, ["", "start", *both, "changes of focus or side"], rows)
@@ -55,7 +55,7 @@ def drive_sentences(drives: Drives) -> list[str]:
 def _arrivals(drives: Drives, arcs: Mapping[str, Sequence[HybridArc]]) -> str:
     counts = []
     for name in arcs:
-        ends = [ending(drives.task, arc) for arc in arcs[name]]
+        ends = [ending(arc) for arc in arcs[name]]
         arrives = f"{ends.count('arrived')}" + f" of {len(ends)} starts" * (name == "policy")
         waits = ends.count("waited")
         counts.append(arrives + f" and waits near a post at the goal from {waits}" * (waits > 0))

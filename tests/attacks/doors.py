@@ -16,12 +16,11 @@ from attacks import Trial, child, command, crafted_agents, folders, resisted
 from attacks.crafted_runs import evil
 from attacks.folders import ESCAPE, plant_modules
 from attacks.forgery import setting
-from attacks.honest import ARGUMENTS, agent, answering, drive, explain, most, robot
+from attacks.honest import ARGUMENTS, CIRCLE, agent, answering, drive, explain, most, robot
 from attacks.material import TASK, Material
 
 # Seconds of the processor within which what is tried in a process of its own must be refused.
 LONGEST = 20.0
-CIRCLE = "hyrl_mj/UnitCircle-v0"
 IDS = (
     *4 * (CIRCLE, "hyrl_mj/Vehicle-v0", "Reacher-v5", "Ant-v5"), "CartPole-v1",
     "evil:Env-v0", "evil:UnitCircle-v0", "os:Env-v0", "evil", "", ".", "../evil", "a" * 5_000, ESCAPE,

@@ -22,6 +22,7 @@ FIELD = {
     "starts": [{"position_m": [3.2, 0.0], "heading_rad": 0.0}],
     "time_s": 1.0,
 }
+CIRCLE = "hyrl_mj/UnitCircle-v0"
 ARGUMENTS = {"pinned": {"qpos[2]": -0.15, "qpos[3]": 0.0}, "success": "reward >= 1"}
 
 
@@ -43,9 +44,9 @@ def diagnose(name: str) -> Work:
     return command("diagnose", TASK, "--policy", name, "--preset", "smoke", "--out", f"of_{name}")
 
 
-def explain(env: str) -> Work:
+def explain(env: str, file: str = "arguments.json") -> Work:
     """Looks at an environment with a file of arguments."""
-    return command("diagnose", "--explain", "--env", env, "--env-args", "arguments.json")
+    return command("diagnose", "--explain", "--env", env, "--env-args", file)
 
 
 def opened_in_every_way(path: Path) -> list[Work]:
@@ -99,7 +100,8 @@ def _agents(material: Material, folder: Path) -> list[Work]:
 
 def _arguments(material: Material, folder: Path) -> list[Work]:
     (folder / "arguments.json").write_text(json.dumps(ARGUMENTS), encoding="utf-8")
-    return [explain("Reacher-v5")]
+    (folder / "circle.json").write_text('{"chart": {"angle": "theta"}}', encoding="utf-8")
+    return [explain("Reacher-v5"), explain(CIRCLE, "circle.json")]
 
 
 def _models(material: Material, folder: Path) -> list[Work]:

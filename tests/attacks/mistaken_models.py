@@ -8,7 +8,7 @@ SAMPLE = '<numeric name="sample_time" data="0.05"/>'
 BALL = 'size="0.1 0.05" mass="1"'
 KEY = '<key name="start" qpos="0 0" ctrl="1 0"/>'
 SENSOR_X, SENSOR_Y = '<jointpos name="x" joint="x"/>', '<jointpos name="y" joint="y"/>'
-TOUCH = '<contact name="touching" geom1="puck" geom2="obstacle" data="found"/>'
+TOUCH = '<contact name="touching" geom1="puck" data="found"/>'
 JOINT = '<joint name="y" type="slide" axis="0 1 0"/>'
 
 
@@ -72,7 +72,7 @@ MODELS: Mistakes = {
     "a joint that turns": (JOINT, JOINT.replace("slide", "ball")),
     "no sensor of x": (SENSOR_X, ""),
     "no sensor of touch": (TOUCH, ""),
-    "a sensor of nothing": (TOUCH, TOUCH.replace("obstacle", "nobody")),
+    "a sensor of nothing": (TOUCH, TOUCH.replace("puck", "nobody")),
     "sensors in another order": (
         f"{SENSOR_X}\n    {SENSOR_Y}", f"{SENSOR_Y}\n    {SENSOR_X}"
     ),

@@ -21,6 +21,7 @@ OUTCOMES = {
     "crashed": ("crashed", BAD),
     "out_of_bounds": ("left the arena", BAD),
     "stalled": ("stalled", BAD),
+    "waited": ("waited at the goal", OPEN),
     "unstable": ("simulation broke down", BAD),
     "running": ("not there yet", OPEN),
     "missed": ("ended off the goal", OPEN),

@@ -252,7 +252,7 @@ class Panel:
                     scene.geoms[number].transparent = 1
                     if np.array_equal(geom.pos, scene.geoms[number].pos):  # noise does not move it
                         scene.geoms[number].type = HIDDEN
-        if t >= track.end and track.arc.outcome not in ("reached", "running"):
+        if t >= track.end and track.arc.outcome not in ("reached", "running", "waited"):
             for side in ((0.075, 0.075, 0.0), (0.075, -0.075, 0.0)):  # of a cross
                 ends = point - self._larger * np.array(side), point + self._larger * np.array(side)
                 marks.bar(scene, *ends, BAD, self._larger * PATH_WIDTH, marks.ON_TOP + 0.18)
