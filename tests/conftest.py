@@ -20,9 +20,7 @@ from filelock import FileLock
 
 import hyrl_mj
 from hyrl_mj.physics import mjcf
-from hyrl_mj.pipeline import runs
 from hyrl_mj.system import cores
-from hyrl_mj.tasks.checks import check_task
 from hyrl_mj.tasks.scaffold import write_task
 
 # The same examples everywhere, whatever the speed of the machine; `scripts/test --long` tries others, too.
@@ -104,23 +102,6 @@ def coarse_looks():
 
     with pytest.MonkeyPatch.context() as patch:
         coarsen(patch)
-        yield
-
-
-@pytest.fixture(scope="session", autouse=True)
-def tasks_of_the_package_are_checked_once():
-    """Before a run a task is tried out for a second: here those of the package once in each process."""
-    checked = set()
-
-    def check(task):
-        if (kind := type(task)) not in checked:
-            check_task(task)
-        if kind.__module__.startswith("hyrl_mj.tasks."):
-            checked.add(kind)
-        return task
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(runs, "check_task", check)
         yield
 
 

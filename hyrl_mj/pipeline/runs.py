@@ -34,6 +34,7 @@ from hyrl_mj.tasks import (
     check_task,
     get_task,
     hidden_goal,
+    is_of_this_package,
     jumped_over,
     overlooked,
     try_elsewhere,
@@ -231,7 +232,7 @@ def usable_task(task: str | Path | Task) -> Task:
     found = get_task(task)
     if found is task:
         check_as_made(found)
-    return check_task(found)
+    return found if is_of_this_package(found) else check_task(found)
 
 
 def extend_again(run: directory.Run, horizon: float, say: Say = print) -> Run:
@@ -259,10 +260,11 @@ def _run_all(
     s = run.settings
     if not run.manifest.is_done("train"):
         task = run.task
-        cautions = overlooked(task), jumped_over(task), hidden_goal(task, s.eps, s.everywhere)
-        for caution in cautions:
-            if caution:
-                say(caution)
+        cautions = [hidden_goal(task, s.eps, s.everywhere)]
+        if not is_of_this_package(task):
+            cautions += [overlooked(task), jumped_over(task)]
+        for caution in filter(None, cautions):
+            say(caution)
     if "partition" in stages and not run.manifest.is_done("partition"):
         bounds = run.task.noise_in_chart(s.eps, s.everywhere)
         if sentence := coarseness(run.task.chart, s.cells, bounds):

@@ -119,6 +119,11 @@ def get_task(name: str | Path | Task) -> Task:
     return _instance(_REGISTRY[name], name)
 
 
+def is_of_this_package(task: Task) -> bool:
+    """Returns whether a task is one of this package, which its tests have tried already."""
+    return type(task).__module__.startswith("hyrl_mj.tasks.")
+
+
 def reference(task: Task) -> str:
     """Returns what `get_task` finds a task by in another process: its name, its file, or its text."""
     if task.spec:
