@@ -1,5 +1,5 @@
 # Sourced by demo and test: a virtual environment of the checkout's own, and where it may, the GL library.
-# Usage: . scripts/setup.sh EXTRAS    (EXTRAS is what to install, as in ".[test]")
+# Usage: . scripts/setup.sh EXTRAS [browser]    (EXTRAS is what to install, as in ".[test]")
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
 python=""
@@ -24,11 +24,16 @@ apt_install() {
 }
 
 # Rendering without a screen takes GL libraries that pip does not bring: EGL, and OpenGL's own functions. Without
-# them there is no video, and everything else runs.
+# them there is no video, and everything else runs. Debian's packages come while pip installs.
 libraries=$(PATH="$PATH:/usr/sbin:/sbin" ldconfig -p 2>/dev/null || true)
-if [ "$(uname)" = Linux ] && ! [[ $libraries == *libEGL.so.1* && $libraries =~ lib(OpenGL.so.0|GL.so.1) ]]; then
-  gl="libegl1 libopengl0 libgl1-mesa-dri"
-  apt_install $gl || echo "There will be no videos: for them, apt-get install $gl as root."
+gl="libegl1 libopengl0 libgl1-mesa-dri"
+if [ "$(uname)" = Linux ]; then
+  {
+    [[ $libraries == *libEGL.so.1* && $libraries =~ lib(OpenGL.so.0|GL.so.1) ]] || apt_install $gl ||
+      echo "There will be no videos: for them, apt-get install $gl as root."
+    [ "${2:-}" != browser ] || command -v chromium >/dev/null || apt_install chromium ||
+      echo "The report is not looked at in a browser: apt-get install chromium as root."
+  } &
 fi
 
 venv="${HYRL_MJ_VENV:-.venv}"
@@ -40,11 +45,12 @@ if ! [ -x "$venv/bin/pip" ]; then
   echo "Making a virtual environment in $venv ..."
   # Debian ships Python without what venv needs to bring pip along.
   "$python" -m venv "$venv" >/dev/null 2>&1 ||
-    { apt_install python3-venv && "$python" -m venv --clear "$venv" >/dev/null; } || {
+    { wait && apt_install python3-venv && "$python" -m venv --clear "$venv" >/dev/null; } || {
       echo "Python's venv is incomplete: apt-get install python3-venv as root, and run this again." >&2
       exit 2
     }
 fi
 echo "Installing hyrl_mj into $venv (a minute or two the first time) ..."
 "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --editable "$1"
+wait
 PATH="$(cd "$venv/bin" && pwd):$PATH"
