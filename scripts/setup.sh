@@ -51,6 +51,7 @@ if ! [ -x "$venv/bin/pip" ]; then
     }
 fi
 echo "Installing hyrl_mj into $venv (a minute or two the first time) ..."
-"$venv/bin/python" -m pip install --quiet --disable-pip-version-check --editable "$1"
+# Python compiles what it imports, and most of what is installed is never imported.
+"$venv/bin/python" -m pip install --quiet --disable-pip-version-check --no-compile --editable "$1"
 wait
 PATH="$(cd "$venv/bin" && pwd):$PATH"
