@@ -320,7 +320,10 @@ def test_walls_that_nothing_collides_with_are_none_and_warnings_are_not_written(
         ({"chart": 3}, "chart 3 cannot be used: give a name"),
         ({"seed": -1}, "seed -1 cannot be used"),
         ({"reset": [1]}, "reset .* give a dictionary"),
-        ({"kwargs": {"render_mode": "human"}}, "render_mode 'human' cannot be used: give rgb_array"),
+        (
+            {"kwargs": {"render_mode": "human"}},
+            "render_mode 'human' cannot be used: give rgb_array",
+        ),
         ({"pinned": {"qpos[0]": "a"}}, "pinned .* give a finite number"),
         ({"pinned": {"qpos[0]": [[1], [1, 2]]}}, "pinned .* give a finite number"),
         ({"success": 3}, "success 3 cannot be used"),

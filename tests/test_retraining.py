@@ -1,6 +1,7 @@
 """Stage 6: where a mode is trained, how its policies are judged, and when one is good enough."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -29,7 +30,7 @@ from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.simulation import KINDS
 from hyrl_mj.stages.extended_sets import extend
 from hyrl_mj.stages.grounds import ByEpisodes, ByGame, Episodes, Judged, mode_ground
-from hyrl_mj.stages.retraining import retrain
+from hyrl_mj.stages.retraining import retrain, with_later_images
 
 # ---- where modes are trained
 
@@ -250,6 +251,28 @@ def test_a_mirror_image_that_will_do_is_taken(vehicle, vehicle_sets, quick, monk
     found, _ = retrain(mode_ground(vehicle, vehicle_sets, 1), quick, seed=0, others=[(other, HALF)])
     for name, weight in image.weights.items():
         np.testing.assert_array_equal(found.weights[name], weight)
+
+
+def test_a_mode_trained_in_vain_takes_the_image_of_a_later_one(
+    vehicle, vehicle_sets, quick, monkeypatch
+):
+    vain, good = (
+        untrained(vehicle, quick),
+        training.export(training.build(vehicle, quick, 1), vehicle),
+    )
+    monkeypatch.setattr(
+        ByGame, "judge", lambda ground, policy, twin=None: Judged((0.0, -0.5), policy is not vain)
+    )
+    grounds = partial(mode_ground, vehicle, vehicle_sets)
+    spent, saved = ModeResult(0, 0.5, quick.attempts), ModeResult(0, 0.5, quick.attempts - 1)
+    last = good, ModeResult(1, 1.0, 1)
+    (found, result), kept = with_later_images([(vain, spent), last], grounds, quick)
+    for name, weight in symmetry.mirrored(good).weights.items():
+        np.testing.assert_array_equal(found.weights[name], weight)
+    assert (result.mode, result.attempts) == (0, 0)
+    assert kept == last
+    assert with_later_images([(vain, saved), last], grounds, quick) == [(vain, saved), last]
+    assert with_later_images([last, (vain, spent)], grounds, quick)[1] == (vain, spent)
 
 
 @pytest.mark.slow

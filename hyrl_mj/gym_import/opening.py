@@ -86,7 +86,9 @@ class Description:
                 raise refused(name, named, "a dictionary of names and values")
         if self.kwargs.get("render_mode") == "human":
             raise refused(
-                "render_mode", "human", "rgb_array, or none: hundreds of copies would open a window each"
+                "render_mode",
+                "human",
+                "rgb_array, or none: hundreds of copies would open a window each",
             )
         for name, ends in self.bounds.items():
             if not _all(ends, Real) or len(ends) != 2 or not 0 < ends[1] - ends[0] <= 1e6:

@@ -33,7 +33,6 @@ from hyrl_mj.runs.arcs import replay_arcs
 from hyrl_mj.runs.diagnosis import losses_of, sentences, usual_arc, worst_arc
 from hyrl_mj.runs.directory import Run
 from hyrl_mj.stages import (
-    ExtendedSets,
     HeldInputs,
     Partition,
     boundary,
@@ -47,11 +46,11 @@ from hyrl_mj.stages import (
 )
 from hyrl_mj.system import cores
 from hyrl_mj.system.progress import Say
-from hyrl_mj.tasks import SPARING, Task
+from hyrl_mj.tasks import SPARING
 from hyrl_mj.viz import ReplayOptions, replay_sentence, robustness_sentence
 
 if TYPE_CHECKING:
-    from hyrl_mj.stages.retraining import ModePolicy
+    from hyrl_mj.stages.retraining import Grounds, ModePolicy
 
 # The video with preset smoke only shows that a video can be made.
 SMOKE = ReplayOptions(size=(640, 360), fps=10)
@@ -158,19 +157,27 @@ def extended_sets_stage(run: Run, say: Say) -> None:
 
 def retrain_stage(run: Run, say: Say) -> None:
     """Stage 6: trains the policy of each mode."""
+    from hyrl_mj.stages.grounds import mode_ground
+    from hyrl_mj.stages.retraining import with_later_images
+
     sets, task = run.extended_sets, run.task
     algorithms.check_named(run.settings.stage6.algorithm)
     held = HeldInputs.from_sets(task, sets, run.settings.table) if task.effort.attacked else None
-    # Where the task's reward has led to no goal in stage 1, it leads to none here.
-    shaped = run.arrivals.shaped
-    results = run.settings, shaped, run.steady, run.partition, run.split, run.path / "logs"
-    work = partial(_retrained, task, sets, held, *results)
+    s = run.settings
+    grounds: Grounds = partial(
+        mode_ground, task, sets, parts=run.split, policy=run.steady, table=held is not None,
+        settings=s.modes, attacks=s.attack,
+        # Where the task's reward has led to no goal in stage 1, it leads to none here.
+        shaped=run.arrivals.shaped,
+    )  # fmt: skip
+    work = partial(_retrained, grounds, held, s, run.steady, run.partition, run.path / "logs")
     done: list[tuple[ModePolicy, ModeResult]] = []
     if task.mirror is None:
         done += cores.in_processes(work, sets.modes)
     else:  # the mirror image of the policy of one mode may do for the next
         for q in sets.modes:
             done.append(work(q, tuple(done)))
+        done = with_later_images(done, grounds, s.stage6)
     for policy, result in done:
         policy.save(run.path / f"mode_{result.mode}.safetensors")
     Retraining(tuple(result for _, result in done)).save(run.path / "retraining.json")
@@ -179,27 +186,24 @@ def retrain_stage(run: Run, say: Say) -> None:
 
 
 def _retrained(
-    task: Task,
-    sets: ExtendedSets,
+    grounds: Grounds,
     held: HeldInputs | None,
     s: Settings,
-    shaped: bool,
     policy: Policy,
     partition: Partition,
-    split: Partition,
     logs: Path,
     mode: int,
     others: Iterable[tuple[ModePolicy, ModeResult]] = (),
 ) -> tuple[ModePolicy, ModeResult]:
     """Trains the policy of one mode, which may happen in a process of a pool."""
-    from hyrl_mj.stages.grounds import mode_ground
     from hyrl_mj.stages.retraining import retrain, start_policy
 
+    ground = grounds(mode)
     part = None
-    if task.effort.attacked:
-        part = part_policies(task, policy, partition, sets.eps)[mode]
+    if ground.task.effort.attacked:
+        part = part_policies(ground.task, policy, partition, ground.extended.eps)[mode]
     return retrain(
-        mode_ground(task, sets, mode, split, policy, held is not None, s.modes, s.attack, shaped),
+        ground,
         s.stage6,
         s.seed,
         warm_start=partial(start_policy, policy, partition),

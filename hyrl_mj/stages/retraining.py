@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +20,8 @@ from hyrl_mj.stages.tables import HeldInputs, TablePolicy, table_for
 ModePolicy = MlpPolicy | PartPolicy | TablePolicy
 # Returns the policy that the first attempt continues from, by the ground of the mode, settings and a seed.
 WarmStart = Callable[["ModeGround", Training, int], MlpPolicy | None]
+# Returns the ground of a mode.
+Grounds = Callable[[int], ModeGround]
 
 
 def start_policy(
@@ -92,14 +94,8 @@ def retrain(
         for untrained in (part,) if held else (part, part.undivided):
             if suffices(untrained):
                 return untrained, _result(ground, untrained, 0)
-    if task.mirror is not None:
-        for other, result in others:
-            if not isinstance(other, MlpPolicy):
-                continue
-            image = symmetry.mirrored(other)
-            won = ground.won_by_image(image, result.won)
-            if won is not None:
-                return image, ModeResult(mode, won, 0)
+    if image := mirror_image(ground, others):
+        return image
     trainings = 0
     if held is not None:
         suffices(table_for(held, mode))
@@ -120,6 +116,32 @@ def retrain(
             break
     best = max(tried, key=lambda result: result[0])[1]
     return best, _result(ground, best, trainings)
+
+
+def mirror_image(
+    ground: ModeGround, others: Iterable[tuple[ModePolicy, ModeResult]]
+) -> tuple[ModePolicy, ModeResult] | None:
+    """Returns the first mirror image of policies of other modes that is good enough for a mode, if any."""
+    for other, result in others if ground.task.mirror is not None else ():
+        if isinstance(other, MlpPolicy):
+            image = symmetry.mirrored(other)
+            if (won := ground.won_by_image(image, result.won)) is not None:
+                return image, ModeResult(ground.mode, won, 0)
+    return None
+
+
+def with_later_images(
+    done: Sequence[tuple[ModePolicy, ModeResult]], grounds: Grounds, settings: Training
+) -> list[tuple[ModePolicy, ModeResult]]:
+    """Returns the policies of all modes, in which mirror images stand for those that are not good enough.
+
+    A mode that has made all of its trainings in vain takes the image of a later one, if that is.
+    """
+    found = list(done)
+    for i, (policy, result) in enumerate(done):
+        if result.attempts == settings.attempts and not grounds(result.mode).suffices(policy):
+            found[i] = mirror_image(grounds(result.mode), done[i + 1 :]) or found[i]
+    return found
 
 
 def _result(ground: ModeGround, policy: ModePolicy, trainings: int) -> ModeResult:
