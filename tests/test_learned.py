@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,8 +10,8 @@ import pytest
 import hyrl_mj
 from hyrl_mj.errors import HyrlError
 from hyrl_mj.gym_export import BatchedEnv, Domain
-from hyrl_mj.judging import Arrivals, failures
-from hyrl_mj.learning import training
+from hyrl_mj.judging import Arrivals, Failures
+from hyrl_mj.learning import preset, training
 from hyrl_mj.learning.to_go import NoWay, WayToGo
 from hyrl_mj.pipeline import RunOptions, runs
 from hyrl_mj.pipeline.runs import settings_of
@@ -132,7 +133,8 @@ def test_how_episodes_fail_is_counted(vehicle):
         def act(self, measured):
             return measured[:, :1] * 0
 
-    starts, ends, nearest = failures(vehicle, Still())
+    found = Failures.of(vehicle, Still())
+    starts, ends = found.starts, found.ends
     crashed = ends == Outcome.CRASHED
     assert crashed.sum() == 1_000 - Arrivals.measure(vehicle, Still()).arrived > 500
     away = np.abs(starts[:, 1])
@@ -140,7 +142,31 @@ def test_how_episodes_fail_is_counted(vehicle):
     assert away[~crashed].min() == pytest.approx(0.75, abs=0.01)
     legend = figures.draw_arrivals(vehicle, starts, ends).axes[0].get_legend_handles_labels()[1]
     assert legend[-2:] == ["reached (248)", "crashed (752)"]
-    assert nearest > vehicle.close
+    assert found.nearest > vehicle.close
+    assert found.earned is None
+
+
+def test_what_stalls_and_earns_is_told_that_arriving_has_to_pay(circle, vehicle, monkeypatch):
+    class Still:
+        task = circle
+
+        def act(self, measured):
+            return measured[:, :1] * 0
+
+    found = Failures.of(circle, Still())
+    stalled = found.starts[found.ends == Outcome.STALLED]
+    at, still = circle.placed(stalled).measurement, np.zeros((len(stalled), 1))
+    assert found.earned == pytest.approx(circle.reward(at, still).mean())
+    assert vehicle.ends_well
+    settings = SimpleNamespace(stage1=preset(vehicle, "smoke").stage1)
+    run = SimpleNamespace(task=vehicle, settings=settings, arrivals=Arrivals(0, 0, 2), policy=None)
+    ends = np.full(2, Outcome.STALLED)
+    for earned, told in ((0.9, True), (-0.9, False)):
+        failures = Failures(np.zeros((2, 2)), ends, 0.1, earned)
+        monkeypatch.setattr(Failures, "of", lambda *_, failures=failures: failures)
+        with pytest.raises(HyrlError, match=r"2 stalled; the nearest comes within 0\.1 of") as error:
+            runs._check_learned(run)
+        assert ("earn 0.9 a sample where they are, and nothing once" in f"{error.value}") == told
 
 
 SECOND = '<geom name="obstacle_2" type="cylinder" pos="0.6 0.9 0.1" size="0.2 0.1"/>'

@@ -8,7 +8,7 @@ from hyrl_mj.judging.attacks import Attack, Budget, attack, attack_starts
 from hyrl_mj.judging.episodes import Regions, noisy_episodes
 from hyrl_mj.judging.evidence import VerdictSettings, by_kind
 from hyrl_mj.judging.examination import USUAL, Examination, ExamineOptions, Subject, examine
-from hyrl_mj.judging.results import Arrivals, Kind, ModeResult, Retraining, failures
+from hyrl_mj.judging.results import Arrivals, Failures, Kind, ModeResult, Retraining
 from hyrl_mj.judging.sentences import POLICIES, margin_text, mode_sentence, replays_sentence
 from hyrl_mj.judging.verdict import Verdict, Word
 
@@ -20,6 +20,7 @@ __all__ = [
     "Budget",
     "Examination",
     "ExamineOptions",
+    "Failures",
     "Kind",
     "ModeResult",
     "Regions",
@@ -32,7 +33,6 @@ __all__ = [
     "attack_starts",
     "by_kind",
     "examine",
-    "failures",
     "game",
     "margin_text",
     "mode_sentence",

@@ -65,24 +65,39 @@ class Arrivals(artifacts.SavedAsJson):
         return Arrivals(int(arrived.sum()), int(missed.sum()), len(arrived))
 
 
-def failures(task: Task, policy: Policy) -> tuple[np.ndarray, np.ndarray, float | None]:
-    """Returns starts and ends of the episodes of `Arrivals`, and how near those come that do not arrive.
+@dataclass(frozen=True)
+class Failures:
+    """How the episodes of `Arrivals` end.
 
-    These are chart points (n, d), the `Outcome` (n,) of each, and the least distance from the set-point on
-    their way [scaled units], None of a task without one.
+    Attributes:
+        starts, ends: chart points (n, d), and the `Outcome` (n,) of each.
+        nearest: how near those that do not arrive come to the set-point [scaled units]; None of a task
+            without one.
+        earned: the mean reward at the last sample of those that stall; None if none does.
     """
-    run = _episodes(task, policy)
-    if task.set_point is None:
-        return run.path[0], run.outcome, None
-    failed = run.outcome != Outcome.REACHED
-    away = [task.chart.distance(z[failed], task.set_point).min(initial=np.inf) for z in run.path]
-    return run.path[0], run.outcome, float(min(away))
+
+    starts: np.ndarray
+    ends: np.ndarray
+    nearest: float | None
+    earned: float | None
+
+    @staticmethod
+    def of(task: Task, policy: Policy) -> Failures:
+        """Plays the episodes of a policy."""
+        run, nearest, earned = _episodes(task, policy, record=True), None, None
+        failed, stalled = run.outcome != Outcome.REACHED, run.outcome == Outcome.STALLED
+        if task.set_point is not None:
+            away = [task.chart.distance(z[failed], task.set_point) for z in run.path]
+            nearest = min(float(distance.min(initial=np.inf)) for distance in away)
+        if stalled.any():
+            earned = float(task.reward(run.true[-1, stalled], run.u[-1, stalled]).mean())
+        return Failures(run.path[0], run.outcome, nearest, earned)
 
 
-def _episodes(task: Task, policy: Policy) -> Rollout:
+def _episodes(task: Task, policy: Policy, record: bool = False) -> Rollout:
     """Plays a policy from starts of the task, which are the same each time."""
     starts = task.starts(EPISODES, np.random.default_rng(0))
-    settings = LoopSettings(vary=True, label="arrivals")
+    settings = LoopSettings(record=record, states=False, vary=True, label="arrivals")
     return closed_loop(task, PolicyController(policy), starts, settings=settings)
 
 

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 from hyrl_mj.errors import BadInput, HyrlError, check_seed, counted, unknown
 from hyrl_mj.files.manifest import locked
-from hyrl_mj.judging import Arrivals, failures
+from hyrl_mj.judging import Arrivals, Failures
 from hyrl_mj.judging.game import LATTICE
 from hyrl_mj.learning import Settings, Training, changed, preset
 from hyrl_mj.pipeline.steps import DIAGNOSIS, STAGES, extended_sets_stage, run_stage
@@ -287,13 +287,19 @@ def _check_learned(run: directory.Run) -> None:
     if arrivals.most:
         return
     assert isinstance(settings, Training)
-    _, ends, nearest = failures(task, run.policy)
-    counts = Counter(Outcome(int(end)) for end in ends if end != Outcome.REACHED)
+    failures = Failures.of(task, run.policy)
+    counts = Counter(Outcome(int(end)) for end in failures.ends if end != Outcome.REACHED)
     how = ", ".join(f"{count:,} {outcome.label}" for outcome, count in counts.most_common())
-    near = "" if nearest is None else f", and none comes nearer to the set-point than {nearest:.3g}"
+    if failures.nearest is not None:
+        how += f"; the nearest comes within {failures.nearest:.3g} of the set-point"
+    if failures.earned is not None and failures.earned > 0 and task.ends_well:
+        how += (
+            f"; the stalled ones earn {failures.earned:.3g} a sample where they are, and nothing once they "
+            "have arrived: a reward below 0 on the way makes arriving pay"
+        )
     raise HyrlError(
         f"stage 1 has not learned {task.name} in {counted(arrivals.trainings, 'training')}: its policy "
-        f"{arrivals} (the others: {how}{near}). See whether the goal can be reached and whether the reward "
+        f"{arrivals} (the others: {how}). See whether the goal can be reached and whether the reward "
         f"leads there; train longer with --set stage1.samples={2 * settings.samples} and another --out, or "
         "go on as it is with --go-on"
     )

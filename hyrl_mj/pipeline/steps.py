@@ -18,11 +18,11 @@ from hyrl_mj.judging import (
     Arrivals,
     Examination,
     ExamineOptions,
+    Failures,
     ModeResult,
     Retraining,
     Subject,
     examine,
-    failures,
     mode_sentence,
 )
 from hyrl_mj.judging.game import Lattice, Limit, Robustness
@@ -74,7 +74,8 @@ def train_stage(run: Run, say: Say) -> None:
 
         if charts.drawable(run.task.chart):
             path = run.path / "figures" / "arrivals.png"
-            style.write(draw_arrivals(run.task, *failures(run.task, policy)[:2]), path)
+            found = Failures.of(run.task, policy)
+            style.write(draw_arrivals(run.task, found.starts, found.ends), path)
             say(f"{path} shows from where it does not arrive")
 
 
