@@ -191,6 +191,16 @@ def test_the_table_and_the_sentence_tell_what_is_lost(vehicle, examined, capsys)
     assert "attack, a search for noise of up to 0.1 m on y" in capsys.readouterr().out
 
 
+def test_the_starts_that_the_attack_broke_are_told(examined):
+    run = load_run(examined)
+    for count in run.robustness.attacks:
+        lost = run.lost(count.controller)
+        assert lost.shape == (count.lost, 2)
+        assert run.task.may_start(lost).all()
+        if count.lost:  # the strongest signal is one of theirs
+            assert (lost == count.start).all(axis=1).any()
+
+
 def test_the_replay_plays_the_strongest_signals_from_one_start(examined):
     (show,) = replay_shows(load_run(examined))
     (policy,), (hyrl,) = show.policy, show.hybrid

@@ -27,7 +27,7 @@ from hyrl_mj.judging.sentences import comparison_sentence
 from hyrl_mj.judging.verdict import Verdict, Word
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.simulation import simulate
-from hyrl_mj.viz.tables import comparison_table, print_verdict
+from hyrl_mj.viz.tables import attack_table, comparison_table, print_verdict
 
 PROVED, WON, HELD, UNDECIDED, WEAK, FAILED = Word
 
@@ -328,6 +328,18 @@ def test_better_is_what_the_same_starts_show(circle, vehicle):
     for task in (circle, goes_on):
         assert "late" not in comparison_sentence(task, far.comparisons[0])
         assert "-" in comparison_table(task, far.comparisons).rows[0]
+
+
+def test_of_no_start_no_figure_is_given(vehicle):
+    none = compared("uniform", 0, 0, 0)
+    assert comparison_sentence(vehicle, none) == (
+        "uniform noise: there is no start that both win without noise, so nothing is compared"
+    )
+    assert comparison_table(vehicle, (none,)).rows[0][4:] == ["-", "-, -", "-; -", "-; -"]
+    one = comparison_table(vehicle, (compared("uniform", 9, 9, 0),)).rows[0]
+    assert one[-3:] == ["-, 0", "-; 1.00 1.00", "-; 1.00 1.00"]  # of runs that arrive
+    row = attack_table(vehicle, (attack_count("policy", 0, 0),)).rows[0]
+    assert row[3:6] == ["0", "-", "-"]
 
 
 # ---- what is said, and kept

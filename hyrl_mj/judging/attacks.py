@@ -107,6 +107,7 @@ class Attack:
             interval=wilson(losses, int(np.sum(~quiet.lost))),
             start=tuple(map(float, arcs[strongest].z[0])),
             outcome=arcs[strongest].outcome,
+            places=tuple(float(x) for i in np.flatnonzero(lost) for x in arcs[i].z[0]),
         )
         return Attack(count, signal, tuple(arcs), quiet, ends, strongest)
 

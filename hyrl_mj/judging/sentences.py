@@ -16,6 +16,8 @@ NAMES = {"policy": "the policy", "hyrl": "HyRL"}
 def comparison_sentence(task: Task, compared: Comparison) -> str:
     """Returns what one kind of noise does to both controllers from the same starts."""
     how = "attack" if compared.noise == "attack" else f"{compared.noise} noise"
+    if not compared.compared:
+        return f"{how}: there is no start that both win without noise, so nothing is compared"
     low, high = compared.interval
     lost, late = compared.lost, compared.late
     # Where an episode goes on after the arrival, its end does not tell when that was.

@@ -11,7 +11,6 @@ from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.judging import Budget, attack
 from hyrl_mj.judging.game import (
     CURVE_CELLS,
-    EPISODES_INSTEAD,
     LATTICE,
     Game,
     lattice_grid,
@@ -121,7 +120,7 @@ def replay_game(run: Run, bound: float) -> Game:
         BadInput: it cannot be played.
     """
     if why := run.why_no_game:
-        raise BadInput(f"{why}: {EPISODES_INSTEAD}")
+        raise BadInput(f"{why}: for the strongest noise that a search finds give the noise 'attack'")
     d = run.task.chart.dimension
     cells = max(run.settings.lattice or LATTICE[d], CURVE_CELLS[d])
     return Game(run.task, run.split, run.controllers, bound, grid=lattice_grid(run.task, cells))

@@ -349,9 +349,9 @@ class Run:
         """Returns the starts (n, d) from which a controller is known to be lost under the noise of the run.
 
         Where the worst-case game decides these are nodes of its lattice that may be starts; of losses between
-        the nodes only the share is known, from the scores. Elsewhere it is the start of the strongest signal
-        of the attack, if that is lost. `run.simulate(run.lost(), "worst")` plays the signals of the game, and
-        "attack" in its place searches again.
+        the nodes only the share is known, from the scores. Elsewhere they are the starts of the attack that
+        it wins without noise, and loses under a signal that was found. `run.simulate(run.lost(), "worst")`
+        plays the signals of the game, and "attack" in its place searches again.
 
         Args:
             controller: "policy" or "hyrl".
@@ -362,8 +362,8 @@ class Run:
         if controller not in self.controllers:
             raise unknown("controller", controller, self.controllers)
         if self.robustness.deciding is None:
-            arc = self.attack_arcs().get(controller)
-            found = [] if arc is None or arc.arrives(self.task) else [arc.z[0]]
+            attacks = self.robustness.attacks
+            found = [x for a in attacks if a.controller == controller for x in a.places]
             return np.reshape(found, (-1, self.task.chart.dimension))
         maps = Maps.load(self._checked("robustness.npz"))
         z = maps.grid(self.task.chart).nodes

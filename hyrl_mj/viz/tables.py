@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -363,14 +363,15 @@ def attack_table(task: Task, counts: Sequence[AttackCount], near_critical: bool 
     rows = []
     for c in counts:
         low, high = (percent(share) for share in c.interval)
+        share = percent(c.lost / c.attacked, surely=False) if c.attacked else "-"
         signal = f"{c.outcome.replace('_', ' ')} from {_point(np.array(c.start))}"
         row = {
             "controller": NAMES[c.controller],
             "starts": f"{c.starts:,}",
             "lost without noise": f"{c.unaided:,}",
             "lost": f"{c.lost:,}",
-            "share of the others": percent(c.lost / max(c.attacked, 1), surely=False),
-            "95%": f"{low} - {high}",
+            "share of the others": share,
+            "95%": f"{low} - {high}" if c.attacked else "-",
             "rounds": f"{c.rounds:,}",
             "runs": f"{sum(c.tried.values()):,}",
             "samples": f"{c.samples:,}",
@@ -403,15 +404,18 @@ def comparison_table(task: Task, comparisons: Sequence[Comparison]) -> Table:
     rows = []
     for c in comparisons:
         low, high = (f"{100 * end:.1f}" for end in c.interval)
+        arrive = [who for who, lost in c.lost.items() if lost < c.compared]
         row = {
             "noise": c.noise,
             "lost without noise": _both(c.unaided),
             "starts compared": f"{c.compared:,} of {c.starts:,}",
             "lost under noise": _both(c.lost),
-            "difference, 95% [points]": f"{100 * c.difference:.1f} ({low} to {high})",
-            "late": _both(c.late) if task.tells_arrival else "-",
-            "time, median and 99%": _both(c.time) if task.tells_arrival else "-",
-            "way, median and 99%": _both(c.way),
+            "difference, 95% [points]": f"{100 * c.difference:.1f} ({low} to {high})"
+            if c.compared
+            else "-",
+            "late": _both(c.late, arrive) if task.tells_arrival else "-",
+            "time, median and 99%": _both(c.time, arrive) if task.tells_arrival else "-",
+            "way, median and 99%": _both(c.way, arrive),
         }
         rows.append(row)
     names = " and ".join(NAMES[name] for name in comparisons[0].lost)
@@ -423,10 +427,17 @@ def comparison_table(task: Task, comparisons: Sequence[Comparison]) -> Table:
     return Table.of(f"{task.name}: {title}", rows, note)
 
 
-def _both(values: Mapping[str, int | tuple[float, float]]) -> str:
-    """Returns the values of both controllers, as "20, 3"."""
+def _both(
+    values: Mapping[str, int | tuple[float, float]], only: Collection[str] | None = None
+) -> str:
+    """Returns the values of both controllers, as "20, 3", and "-" for one that is not in `only`."""
     texts = [
-        f"{v[0]:.2f} {v[1]:.2f}" if isinstance(v, tuple) else f"{v:,}" for v in values.values()
+        "-"
+        if only is not None and who not in only
+        else f"{v[0]:.2f} {v[1]:.2f}"
+        if isinstance(v, tuple)
+        else f"{v:,}"
+        for who, v in values.items()
     ]
     return ("; " if any(isinstance(v, tuple) for v in values.values()) else ", ").join(texts)
 

@@ -16,7 +16,7 @@ from hyrl_mj.judging.game.counts import (
     compare,
     wilson,
 )
-from hyrl_mj.judging.game.lattice import EPISODES_INSTEAD, Lattice, Places, nearest_of
+from hyrl_mj.judging.game.lattice import Lattice, Places, nearest_of
 from hyrl_mj.judging.game.limit import Limit, fewest_samples
 from hyrl_mj.judging.game.resolution import (
     CURVE_CELLS,

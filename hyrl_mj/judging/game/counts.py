@@ -69,6 +69,7 @@ class AttackCount:
         start: (d,) the start of the strongest signal: of the earliest failure, or where nothing is lost of
             the run with the greatest danger.
         outcome: how the run from there ends.
+        places: (lost * d,) the starts for which such a signal was found, one after the other.
     """
 
     controller: str
@@ -84,6 +85,7 @@ class AttackCount:
     tried: dict[str, int]
     start: tuple[float, ...]
     outcome: str
+    places: tuple[float, ...] = ()
 
     @property
     def attacked(self) -> int:
@@ -98,7 +100,8 @@ class AttackCount:
     @property
     def is_whole(self) -> bool:
         """Whether there are starts, and no more of them are lost than there are."""
-        return 0 <= self.lost <= self.attacked and self.starts > 0 and self.rounds > 0
+        numbers = len(self.places) == self.lost * len(self.start)
+        return numbers and 0 <= self.lost <= self.attacked and self.starts > 0 and self.rounds > 0
 
 
 @dataclass(frozen=True)

@@ -27,9 +27,6 @@ from hyrl_mj.tasks import Outcome, Task
 ON_NODE = 1e-3
 # Nodes from which a plant is stepped that moves all of them alike, up to this distance [chart units].
 SAMPLE, ALIKE = 1_000, 1e-9
-EPISODES_INSTEAD = (
-    "use noisy episodes instead (hyrl-mj robustness RUN --episodes N --noise adversarial)"
-)
 
 
 @dataclass(frozen=True)
@@ -137,7 +134,9 @@ class Lattice(Places):
     def check(task: Task, grid: Grid | None = None) -> None:
         """Raises `BadInput` unless the game can be played on nodes of this task's chart."""
         if why := Lattice.why_not(task, grid):
-            raise BadInput(f"{why}: {EPISODES_INSTEAD}")
+            raise BadInput(
+                f"{why}: use noisy episodes instead (hyrl-mj robustness RUN --episodes N --noise adversarial)"
+            )
 
     @staticmethod
     def decides(task: Task, grid: Nodes) -> bool:
