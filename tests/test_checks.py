@@ -125,6 +125,17 @@ MISTAKES = {
     "sides exchanged": ((PY, r'\("left", "right"\)', '("Right", "Left")'), "passes the obstacle on its left"),
     "centimetres of metres": ((PY, r'\("m", "m"\)', '("m", "cm")'), "y is said to be in cm.*: say m"),
     "a mirror that is no symmetry": ((PY, r"\(1, -1, -1\)", "(1, 1, 1)"), "mirror is no symmetry of it"),
+    "an input twice": (
+        (PY, r'\("lateral",\), \("m/s",\)', '("lateral",) * 2, ("m/s",) * 2'), "name each once"
+    ),
+    "joints without a state": (
+        (
+            (PY, r"    def state\(self", "    def _state(self"),
+            (XML, '<body name="robot">', '<body><joint/><geom size="0.1"/></body><body name="robot">'),
+            (XML, 'qpos="0 0"', 'qpos="0 0 0"'),
+        ),
+        r"2 coordinate\(s\), and .* 3 positions of joints .*give the task a state",
+    ),
     "an input without effect": ((XML, 'kv="12"', 'kv="0"'), "input lateral changes nothing"),
     "a link too heavy": ((XML, 'mass="1"', 'mass="1e300"'), "input lateral changes nothing"),
     "a mass that is nan": ((XML, 'mass="1"', 'mass="nan"'), "XML contains a 'NaN'"),

@@ -18,7 +18,7 @@ from hyrl_mj.pipeline.runs import settings_of
 from hyrl_mj.pipeline.steps import run_stage
 from hyrl_mj.policies import MlpPolicy
 from hyrl_mj.runs.directory import opened
-from hyrl_mj.tasks import Outcome, hidden_goal, jumped_over, overlooked
+from hyrl_mj.tasks import Outcome, hidden_goal, jumped_over, overlooked, torn
 from hyrl_mj.tasks.scaffold import write_task
 from hyrl_mj.viz import figures
 
@@ -193,7 +193,27 @@ def test_a_second_obstacle_of_the_template_is_a_crash_and_a_forgotten_one_is_tol
 
 def test_no_task_of_the_package_overlooks_an_obstacle_or_jumps_over_it():
     tasks = [hyrl_mj.get_task(name) for name in hyrl_mj.task_names()]
-    assert not [t for t in tasks if t.source is None and (overlooked(t) or jumped_over(t))]
+    own = [task for task in tasks if task.source is None]
+    assert not [t for t in own if overlooked(t) or jumped_over(t) or torn(t)]
+
+
+TRAILER = '<body><joint name="trailer" type="slide" axis="0 1 0"/><geom size="0.05"/></body>'
+DRAWN = '<equality><joint name="bar" joint1="trailer" joint2="y"/></equality>'
+
+
+@pytest.mark.parametrize("forgotten", [False, True])
+def test_a_state_that_an_equality_constraint_pulls_together_is_told(forgotten, tmp_path):
+    name = "a_forgotten_trailer" if forgotten else "a_trailer"
+    write_task(name, tmp_path)
+    model, path = tmp_path / f"{name}.xml", tmp_path / f"{name}.py"
+    text = model.read_text().replace("<worldbody>", f"<worldbody>{TRAILER}", 1)
+    text = text.replace("<actuator>", f"{DRAWN}<actuator>").replace('qpos="0 0"', 'qpos="0 0 0"')
+    model.write_text(text)
+    first = "0 * z[:, 1:]" if forgotten else "z[:, 1:]"
+    code = path.read_text().replace("return z, np", f"return np.hstack([{first}, z]), np")
+    path.write_text(code.replace("([np.ones", "([drift, np.ones"))
+    said = torn(hyrl_mj.get_task(path))
+    assert ("puts the robot where bar is off by 1." in said) == forgotten == bool(said)
 
 
 @pytest.mark.parametrize(

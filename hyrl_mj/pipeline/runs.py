@@ -37,6 +37,7 @@ from hyrl_mj.tasks import (
     is_of_this_package,
     jumped_over,
     overlooked,
+    torn,
     try_elsewhere,
 )
 from hyrl_mj.viz import Run, beginning, load_run
@@ -262,7 +263,7 @@ def _run_all(
         task = run.task
         cautions = [hidden_goal(task, s.eps, s.everywhere)]
         if not is_of_this_package(task):
-            cautions += [overlooked(task), jumped_over(task)]
+            cautions += [torn(task), overlooked(task), jumped_over(task)]
         for caution in filter(None, cautions):
             say(caution)
     if "partition" in stages and not run.manifest.is_done("partition"):

@@ -120,7 +120,9 @@ def replay_game(run: Run, bound: float) -> Game:
         BadInput: it cannot be played.
     """
     if why := run.why_no_game:
-        raise BadInput(f"{why}: for the strongest noise that a search finds give the noise 'attack'")
+        raise BadInput(
+            f"{why}: for the strongest noise that a search finds give the noise 'attack'"
+        )
     d = run.task.chart.dimension
     cells = max(run.settings.lattice or LATTICE[d], CURVE_CELLS[d])
     return Game(run.task, run.split, run.controllers, bound, grid=lattice_grid(run.task, cells))

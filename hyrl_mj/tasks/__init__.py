@@ -8,7 +8,7 @@ from importlib import import_module
 from pkgutil import iter_modules
 
 from hyrl_mj.tasks.base import Task, at_levels
-from hyrl_mj.tasks.checks import check_task, hidden_goal, jumped_over, overlooked
+from hyrl_mj.tasks.checks import check_task, hidden_goal, jumped_over, overlooked, torn
 from hyrl_mj.tasks.description import (
     SEARCHES,
     SPARING,
@@ -95,6 +95,7 @@ __all__ = [
     "sides",
     "stands_still",
     "task_names",
+    "torn",
     "touching",
     "try_elsewhere",
     "way_name",

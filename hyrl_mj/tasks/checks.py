@@ -24,6 +24,7 @@ from hyrl_mj.tasks.obstacles import SIDES
 # Number of starts that are tried, and of places at which robot and obstacles may overlap.
 STARTS, OVERLAPS = 64, 512
 NEARER = (0.1, 0.01, 0.001)
+TORN = 0.01  # by how much a constraint may be off where a state begins [m, rad]: soft ones give a little
 WHOLE_TURN_OF_OTHERS = {"rad": 360.0, "deg": 2 * np.pi, "°": 2 * np.pi}
 HOPS = 10  # samples of runs in which it is looked for what is jumped over
 LONGEST = 3_600  # time that is shown [s]
@@ -108,6 +109,31 @@ def overlooked(task: Task) -> str:
                         "episode end there"
                     )
     return ""
+
+
+def torn(task: Task) -> str:
+    """Returns where `state` puts a robot that an equality constraint then pulls together; "" if nowhere."""
+    model, chart, worst = task.model, task.chart, ("", TORN)
+    if type(task).plant is not Task.plant or not model.neq:
+        return ""
+    z, data = chart.draw(STARTS, np.random.default_rng(0)), mujoco.MjData(model)
+    for point, qpos in zip(z, task.placed(z).qpos, strict=True):
+        mjcf.place(model, data, qpos, task.mocap)
+        mujoco.mj_fwdPosition(model, data)
+        off = np.abs(data.efc_pos[: data.ne])
+        if off.max(initial=0.0) > worst[1]:
+            number = data.efc_id[off.argmax()]
+            name = model.equality(number).name or f"equality constraint {number}"
+            worst = (
+                f"{name} is off by {off.max():.2g} (m or rad), as at {chart.format(point)}",
+                float(off.max()),
+            )
+    if not worst[0]:
+        return ""
+    return (
+        f"state() puts the robot where {worst[0]}: MuJoCo pulls it together in the first samples, and "
+        "moves it by that; let state() give the positions of all joints that belong to the chart point"
+    )
 
 
 def jumped_over(task: Task) -> str:
@@ -250,6 +276,8 @@ def _check_parts(task: Task) -> None:
         raise BadInput(f"its name is {task.name!r}: give letters, digits and _, as my_robot")
     for name, rule in RULES.items():
         rule.checked(name, attrgetter(name)(task))
+    if len(set(task.inputs)) < len(task.inputs):
+        raise BadInput(f"inputs is {task.inputs}: name each once")
     chart, d = task.chart, task.chart.dimension
     if d > MOST_DIMENSIONS:
         raise BadInput(
@@ -348,6 +376,11 @@ def _check_model(task: Task) -> None:
         )
     if not model.nu:
         raise BadInput(f"{path.name} has no actuators: give the policy at least one to drive")
+    if type(task).state is Task.state and model.nq != (d := task.chart.dimension):
+        raise BadInput(
+            f"its chart has {d} coordinate(s), and {path.name} {model.nq} positions of joints (qpos): give "
+            "the task a state(z, rng) that returns them all"
+        )
     low, high = task.input_limits
     if not (np.isfinite([low, high]).all() and (low < high).all()):
         raise BadInput(
