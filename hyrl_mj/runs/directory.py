@@ -357,13 +357,18 @@ class Run:
             controller: "policy" or "hyrl".
 
         Raises:
-            BadInput: there is no such controller, or the run has not been examined.
+            BadInput: there is no such controller, the run has not been examined, or another version did it.
         """
         if controller not in self.controllers:
             raise unknown("controller", controller, self.controllers)
         if self.robustness.deciding is None:
-            attacks = self.robustness.attacks
-            found = [x for a in attacks if a.controller == controller for x in a.places]
+            attacks = [a for a in self.robustness.attacks if a.controller == controller]
+            found = [x for a in attacks for x in a.places]
+            if not found and any(a.lost for a in attacks):
+                raise BadInput(
+                    f"the attack on {self.path} is of another version, which did not keep its starts: run "
+                    f"hyrl-mj robustness {self.path} again"
+                )
             return np.reshape(found, (-1, self.task.chart.dimension))
         maps = Maps.load(self._checked("robustness.npz"))
         z = maps.grid(self.task.chart).nodes

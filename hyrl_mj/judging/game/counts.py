@@ -69,7 +69,8 @@ class AttackCount:
         start: (d,) the start of the strongest signal: of the earliest failure, or where nothing is lost of
             the run with the greatest danger.
         outcome: how the run from there ends.
-        places: (lost * d,) the starts for which such a signal was found, one after the other.
+        places: (lost * d,) the starts for which such a signal was found, one after the other; () in files of
+            version 1.0.0.
     """
 
     controller: str
@@ -100,7 +101,7 @@ class AttackCount:
     @property
     def is_whole(self) -> bool:
         """Whether there are starts, and no more of them are lost than there are."""
-        numbers = len(self.places) == self.lost * len(self.start)
+        numbers = len(self.places) in (0, self.lost * len(self.start))
         return numbers and 0 <= self.lost <= self.attacked and self.starts > 0 and self.rounds > 0
 
 
