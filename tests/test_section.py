@@ -1,5 +1,6 @@
 """The plane that is drawn of a chart of three dimensions."""
 
+from copy import copy, deepcopy
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -15,7 +16,7 @@ from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.partition import Partition
 from hyrl_mj.viz import section as section_module
-from hyrl_mj.viz.replay.marks import on_floor
+from hyrl_mj.viz.replay.marks import ON_FLOOR, on_floor, tracked_points
 from hyrl_mj.viz.section import Section
 
 HEIGHT, RADIUS = 0.3, 0.7
@@ -117,6 +118,13 @@ def test_what_lies_on_the_floor_is_below_who_flies(puck):
     np.testing.assert_array_equal(laid[:, :2], points[:, :2])
     assert 0 < laid[0, 2] < 0.02
     assert laid[1, 2] == 0.012
+
+
+def test_marks_of_a_point_in_the_floor_lie_on_it(puck):
+    low = copy(puck)
+    low.model = deepcopy(puck.model)
+    low.model.site("tracked").pos[2] = -0.3
+    assert tracked_points(low, np.zeros((1, 2)))[0, 2] == -2 * ON_FLOOR
 
 
 def test_where_there_is_no_critical_set_there_is_none_in_the_plane(cube):

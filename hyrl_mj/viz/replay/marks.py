@@ -89,13 +89,23 @@ def _add(
 
 
 def tracked_points(task: Task, qpos: np.ndarray) -> np.ndarray:
-    """Returns the points (n, 3) [m] of what the task's scene tracks at positions (n, nq)."""
+    """Returns the points (n, 3) [m] of what the task's scene tracks at positions (n, nq).
+
+    Points in or under the floor are lifted on it: nobody would see the marks below them.
+    """
     data, points = mujoco.MjData(task.model), np.empty((len(qpos), 3))
     kind, number = mjcf.point_of(task.model, task.scene.tracked)
     for point, position in zip(points, qpos, strict=True):
         mjcf.place(task.model, data, position, task.mocap)
         point[:] = getattr(data, kind)[number]
+    points[:, 2] = np.maximum(points[:, 2], _ground(task) - 2 * ON_FLOOR)
     return points
+
+
+def _ground(task: Task) -> float:
+    """Returns the height of the geom "floor" [m], -inf if there is none."""
+    floor = mujoco.mj_name2id(task.model, mujoco.mjtObj.mjOBJ_GEOM, "floor")
+    return -np.inf if floor < 0 else float(task.model.geom_pos[floor, 2])
 
 
 @dataclass(frozen=True)
@@ -179,11 +189,8 @@ def on_floor(task: Task, points: np.ndarray) -> np.ndarray:
 
     A robot flies if its point is more than 0.3 m above the floor.
     """
-    floor = mujoco.mj_name2id(task.model, mujoco.mjtObj.mjOBJ_GEOM, "floor")
-    if floor < 0:
-        return points
-    ground = task.model.geom_pos[floor, 2]
-    flies = points[:, 2] > ground + 0.3
+    ground = _ground(task)
+    flies = np.isfinite(ground) & (points[:, 2] > ground + 0.3)
     height = np.where(flies, ground - 2 * ON_FLOOR, points[:, 2])
     return np.column_stack([points[:, :2], height])
 
