@@ -321,10 +321,12 @@ def _check_parts(task: Task) -> None:
             f"noisy is {task.noisy}: give a share > 0 of the noise bound for one column or more"
         )
     # Tables and figures give the bound as the noise of the coordinates with share 1.
-    if task.source is not None and any(shares[:d]) and 1 not in shares[:d]:
+    if task.source is not None and 1 not in shares[:d]:
+        most, remedy = max(shares[:d]), "let the chart hold a column of the measurement on which noise acts"
+        if most:
+            remedy = f"divide it by {most:g}, and give an eps that is {most:g} times as large"
         raise BadInput(
-            f"noisy is {task.noisy}, so that --eps is the noise of none of {listed(chart.names)}: divide it "
-            f"by {max(shares[:d]):g}, and give an eps that is {max(shares[:d]):g} times as large"
+            f"noisy is {task.noisy}, so that --eps is the noise of none of {listed(chart.names)}: {remedy}"
         )
 
 
