@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.transforms import Bbox, TransformedBbox
 
 from hyrl_mj.sets import Chart
 from hyrl_mj.simulation import HybridArc
@@ -21,6 +22,10 @@ from hyrl_mj.viz.section import Section
 from hyrl_mj.viz.tables import NAMED
 
 CORE = 0.4  # the radius at which spirals begin; they end at 1
+# How far beside a panel marks are drawn, in parts of it: that of an end just out of bounds is, but not one of
+# a robot that was thrown far off, whose path is cut at the edge.
+EDGE = 0.05
+SHOWN = Bbox.from_extents(-EDGE, -EDGE, 1 + EDGE, 1 + EDGE)
 
 
 @dataclass(frozen=True)
@@ -76,8 +81,9 @@ def line(panel: Axes, view: View, t: np.ndarray, z: np.ndarray, **looks: Any) ->
 def mark(panel: Axes, view: View, arc: HybridArc, row: int, shape: Any, **looks: Any) -> None:
     """Marks a row of an arc with one of matplotlib's markers."""
     ((x, y),) = view.points(arc.t[[row]], arc.z[[row]])
-    looks = {"markersize": 6, "clip_on": False, "zorder": 6} | looks
-    panel.plot([x], [y], marker=shape, linestyle="none", **looks)
+    looks = {"markersize": 6, "zorder": 6} | looks
+    (drawn,) = panel.plot([x], [y], marker=shape, linestyle="none", **looks)
+    drawn.set_clip_box(TransformedBbox(SHOWN, panel.transAxes))
 
 
 def ends(panel: Axes, task: Task, view: View, arc: HybridArc) -> None:
@@ -96,6 +102,8 @@ def end(panel: Axes, task: Task, view: View, arc: HybridArc, beside: bool = Fals
     if beside:
         ((x, y),) = view.points(arc.t[[-1]], arc.z[[-1]])
         inner = x > np.mean(panel.get_xlim())
+        if not SHOWN.contains(*(panel.transData - panel.transAxes).transform((x, y))):
+            return
         left = inner == panel.axison  # where there is room: of a ring that is outside
         charts.words(panel, label.removeprefix("end: "), x, y, (-7 if left else 7, 10), colour)
     mark(panel, view, arc, -1, "x", color=colour, markeredgewidth=2, label="" if beside else label)
