@@ -117,7 +117,7 @@ MISTAKES = {
         (PY, r"noisy = .*\n", "noisy = (0, 0.5, 0, 0)\n"), "noise of none of x and y: divide it by 0.5"
     ),
     "noise that no network sees": (
-        (PY, OBSERVED, "return measured[:, [0, 2, 2]]" + THEN), r"noisy columns \[1\].*no network would see it"
+        (PY, OBSERVED, "return measured[:, [0, 2, 2]]" + THEN), r"columns \[1\].*no network would see it"
     ),
     "noise beside the chart": (
         (PY, r"noisy = .*\n", "noisy = (0, 0, 1, 0)\n"), "noise of none of x and y: let the chart hold"

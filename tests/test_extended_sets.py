@@ -184,6 +184,9 @@ def test_a_single_mode_keeps_everything(vehicle):
     assert sets.sentence(vehicle) == "one mode, whose set is the whole chart"
     far = distance_to(vehicle.chart, case.critical.points, np.zeros((3, 2)))
     np.testing.assert_array_equal(far, [np.inf] * 3)
+    late = sets.sets[0].grid.nodes[:, 0] > 1  # all starts lie before
+    said = replace(sets, winning=(late,)).sentence(vehicle)
+    assert "no start of the task is known to arrive in mode 0 (left): stage 6 trains" in said
 
 
 # ---- sized to the noise

@@ -73,11 +73,21 @@ class ExtendedSets(Saved):
 
     def sentence(self, task: Task) -> str:
         """Returns a one-line description."""
-        if len(self.sets) < 2:
-            return "one mode, whose set is the whole chart"
         reach = f"T = {self.horizon:.2g} s" if self.horizon else "as far as the ways are open"
         text = f"{len(self.sets)} extended sets, {reach}{self._shared()}"
-        return "; ".join([text, *self._narrow_places(task)])
+        if len(self.sets) < 2:
+            text = "one mode, whose set is the whole chart"
+        return "; ".join([text, *self._narrow_places(task), *self._without_starts(task)])
+
+    def _without_starts(self, task: Task) -> Iterator[str]:
+        """Yields the modes whose set holds starts of the task, but whose winning region none."""
+        for mode, inside, wins in zip(self.modes, self.sets, self.winning, strict=True):
+            starts = task.may_start(inside.grid.nodes)
+            if wins.any() and (starts & inside.mask).any() and not (starts & wins).any():
+                yield (
+                    f"no start of the task is known to arrive in mode {task.mode_name(mode)}: stage 6 trains "
+                    "and tests it from other states alone"
+                )
 
     @property
     def narrow(self) -> np.ndarray:

@@ -322,7 +322,10 @@ def _check_parts(task: Task) -> None:
         )
     # Tables and figures give the bound as the noise of the coordinates with share 1.
     if task.source is not None and 1 not in shares[:d]:
-        most, remedy = max(shares[:d]), "let the chart hold a column of the measurement on which noise acts"
+        most, remedy = (
+            max(shares[:d]),
+            "let the chart hold a column of the measurement on which noise acts",
+        )
         if most:
             remedy = f"divide it by {most:g}, and give an eps that is {most:g} times as large"
         raise BadInput(
