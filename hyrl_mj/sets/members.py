@@ -102,6 +102,12 @@ class GridSet(StateSet):
         return f"GridSet({self.share:.1%} of {self.grid})"
 
     def signed_distance(self, z: np.ndarray) -> np.ndarray:
+        names = self.grid.chart.names
+        if np.ndim(z) != 2 or np.shape(z)[1] != len(names):
+            raise BadInput(
+                f"points of this set have shape (n, {len(names)}), {', '.join(names)}, got {np.shape(z)}: of "
+                "measurements task.z(measured) gives them"
+            )
         return self._evaluation(z)
 
     @cached_property
