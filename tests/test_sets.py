@@ -264,7 +264,9 @@ def test_numbers_that_do_not_fit_a_grid_are_refused():
 def test_points_with_other_coordinates_than_those_of_the_chart_are_refused(z):
     grid = Grid.with_cells(Chart(("x", "y"), ("m", "m"), (0, 0), (1, 1), (False, False)), 4)
     inside = GridSet.from_mask(grid, grid.nodes[:, 0] > 0.5)
-    with pytest.raises(BadInput, match=r"have shape \(n, 2\), x, y, got .*: of measurements task\.z"):
+    with pytest.raises(
+        BadInput, match=r"have shape \(n, 2\), x, y, got .*: of measurements task\.z"
+    ):
         inside.contains(z)
 
 

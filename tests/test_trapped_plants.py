@@ -351,6 +351,15 @@ SEEMING = {
         {},
         "periodic, and joint theta has a range",
     ),
+    "an angle that is cut": (
+        methods(
+            dial()._replace(kv=1e6),
+            "    def measure(self, sensors):\n        return sensors % (2 * np.pi)\n",
+        ),
+        {},
+        {"chart": '("theta",), ("rad",), (0.0,), (2 * np.pi,), (False,)', "box": "(0.1,), (6.1,)"},
+        r"theta leaps from \S+ to \S+ rad: say in the chart that it is periodic",
+    ),
     "an angle that hides more far away": (
         methods(ends(vehicle(), "ends = ends"), BEARING),
         {},

@@ -40,6 +40,8 @@ LONGEST = 60  # that another process takes [s]
 MOST_HELD = 1_000  # entries of a list or the like that are looked at one by one
 # Samples after which an input must have changed something.
 EFFECT = 10
+# A whole turn of an angle, by its unit; who leaps over nearly that in a sample has crossed the seam.
+TURNS, NEARLY = {"rad": 2 * np.pi, "deg": 360.0, "°": 360.0}, 0.9
 # Number of the sample -> inputs (n, m).
 Inputs = Callable[[int], np.ndarray]
 # Indices (k,) of rows -> what a method gives for them (k, ...).
@@ -481,9 +483,24 @@ def _play(task: Task, z: np.ndarray, inputs: Inputs, kind: str) -> np.ndarray:
         outcome[active] = task.outcome(measurement[active], np.zeros(len(active), dtype=bool))
         _check_step(task, measurement[active], u[active], outcome[active], sample)
         z = task.chart.near(task.z(measurement), path[-1])
+        _check_seam(task, path[-1][active], z[active])
         path.append(np.where((outcome == Outcome.RUNNING)[:, None], z, path[-1]))
     _check_end(task, np.array(path), plant.measurement)
     return outcome
+
+
+def _check_seam(task: Task, before: np.ndarray, after: np.ndarray) -> None:
+    """Raises `BadInput` if an angle that is not said to be periodic goes on at its other end."""
+    chart = task.chart
+    for axis, unit in enumerate(chart.units):
+        leap = np.abs(after[:, axis] - before[:, axis])
+        turn = TURNS.get(unit.strip("[] ").lower(), np.inf)
+        if not chart.periodic[axis] and leap.max() > NEARLY * turn:
+            row = int(leap.argmax())
+            raise BadInput(
+                f"within one sample {chart.names[axis]} leaps from {before[row, axis]:.3g} to "
+                f"{after[row, axis]:.3g} {unit}: say in the chart that it is periodic"
+            )
 
 
 def _check_step(
