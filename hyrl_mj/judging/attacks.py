@@ -107,7 +107,9 @@ class Attack:
             interval=wilson(losses, int(np.sum(~quiet.lost))),
             start=tuple(map(float, arcs[strongest].z[0])),
             outcome=arcs[strongest].outcome,
-            places=tuple(float(x) for i in np.flatnonzero(lost) for x in arcs[i].z[0]),
+            places=tuple(
+                float(x) for arc, beaten in zip(arcs, lost, strict=True) if beaten for x in arc.z[0]
+            ),
         )
         return Attack(count, signal, tuple(arcs), quiet, ends, strongest)
 
