@@ -164,7 +164,9 @@ def test_what_stalls_and_earns_is_told_that_arriving_has_to_pay(circle, vehicle,
     for earned, told in ((0.9, True), (-0.9, False)):
         failures = Failures(np.zeros((2, 2)), ends, 0.1, earned)
         monkeypatch.setattr(Failures, "of", lambda *_, failures=failures: failures)
-        with pytest.raises(HyrlError, match=r"2 stalled; the nearest comes within 0\.1 of") as error:
+        with pytest.raises(
+            HyrlError, match=r"2 stalled; the nearest comes within 0\.1 of"
+        ) as error:
             runs._check_learned(run)
         assert ("earn 0.9 a sample where they are, and nothing once" in f"{error.value}") == told
 

@@ -1,20 +1,23 @@
 """Tables of inputs as the policies of modes, and the game on environments whose chart is their state."""
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from environments import Puck, Slid, puck_agent
-from planted import ChartPolicy, extended, spare_environments
+from planted import ChartPolicy, extended, one_way_policy, spare_environments
 
 from hyrl_mj import BadArtifact, from_gymnasium
 from hyrl_mj.judging.game import Lattice, lattice_grid
 from hyrl_mj.judging.worst_case import worst_case
+from hyrl_mj.learning import preset
+from hyrl_mj.pipeline.steps import _retrained
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.simulation import Signal, closed_loop, policy_runs
-from hyrl_mj.stages import PartPolicy
+from hyrl_mj.stages import Partition, PartPolicy
 from hyrl_mj.stages.grounds import ByAttack, mode_ground
 from hyrl_mj.stages.retraining import retrain
 from hyrl_mj.stages.tables import (
@@ -222,13 +225,33 @@ def test_the_best_of_what_is_given_is_taken_and_nothing_is_trained(
     part = PartPolicy(puck, ChartPolicy(puck, lambda z: z), half.eroded(0.1), 0.1)
     monkeypatch.setattr("hyrl_mj.stages.retraining.table_for", lambda held, mode: made)
     given = held if "table" in scores else None
-    _, result = retrain(Ground(), SimpleNamespace(attempts=1), 0, part=part, held=given)
+    untrained = [part] if given else [part, part.undivided]
+    _, result = retrain(Ground(), SimpleNamespace(attempts=1), 0, untrained=untrained, held=given)
     assert (result.policy, result.attempts, result.won) == (taken, 0, scores[taken])
     plant = puck.plant(held.grid.size)
     plant.set_state(*puck.state(held.grid.nodes))
     own = part.policy.act(plant.measurement)
     np.testing.assert_array_equal(part.undivided.act(plant.measurement), own)
     assert (part.act(plant.measurement) != own).any()
+
+
+@pytest.mark.parametrize(("modes", "tried"), [(1, ["agent"]), (2, [])])
+def test_the_policy_of_stage_1_is_tried_first_where_nothing_is_decided(
+    modes, tried, vehicle, monkeypatch, tmp_path
+):
+    grid = Grid.with_cells(vehicle.chart, 24)
+    every = np.ones(grid.size, dtype=bool)
+    sets = of_masks(grid, *[every] * modes)
+    partition = Partition(sets.modes, tuple(sets.sets), every)
+    policy, settings = one_way_policy(vehicle), preset(vehicle, "smoke")
+    grounds = partial(mode_ground, vehicle, sets)
+
+    def retrained(ground, *given, untrained, **more):
+        assert all(one.policy is policy and one.whole for one in untrained)
+        return ["agent" for _ in untrained]
+
+    monkeypatch.setattr("hyrl_mj.stages.retraining.retrain", retrained)
+    assert _retrained(grounds, None, settings, policy, partition, tmp_path, 0) == tried
 
 
 def test_a_policy_is_judged_without_noise_and_by_an_attack(puck):

@@ -199,17 +199,19 @@ def _retrained(
     """Trains the policy of one mode, which may happen in a process of a pool."""
     from hyrl_mj.stages.retraining import retrain, start_policy
 
-    ground = grounds(mode)
-    part = None
-    if ground.task.effort.attacked:
+    ground, untrained = grounds(mode), []
+    attacked = ground.task.effort.attacked
+    if attacked or len(ground.extended.modes) == 1:  # or nothing is to be decided
         part = part_policies(ground.task, policy, partition, ground.extended.eps)[mode]
+        # Without a table only trainings could follow: the first policy is tried unchanged, too.
+        untrained = [part] * attacked + [part.undivided] * (held is None)
     return retrain(
         ground,
         s.stage6,
         s.seed,
         warm_start=partial(start_policy, policy, partition),
         others=others,
-        part=part,
+        untrained=untrained,
         held=held,
         log_dir=logs / f"mode_{mode}",
     )

@@ -53,7 +53,7 @@ def retrain(
     *,
     warm_start: WarmStart | None = None,
     others: Iterable[tuple[ModePolicy, ModeResult]] = (),
-    part: PartPolicy | None = None,
+    untrained: Iterable[ModePolicy] = (),
     held: HeldInputs | None = None,
     log_dir: Path | None = None,
 ) -> tuple[ModePolicy, ModeResult]:
@@ -71,16 +71,16 @@ def retrain(
             set; see `start_policy`.
         others: policies of other modes, and how their trainings ended; a mirror image of one is used if it is
             good enough for this mode.
-        part: pi_i of the mode (paper, Step 4), which is used as it is if it is good enough, or else, without
-            a table, the stage-1 policy itself; by default neither is tried.
+        untrained: policies of which the first one is used as it is that is good enough, such as pi_i of the
+            mode (paper, Step 4), or the stage-1 policy itself.
         held: what a table of inputs is made from; the better of it and pi_i then takes the place of the
             trainings.
         log_dir: folder of logs and checkpoints.
 
     Returns:
-        pi_i, the stage-1 policy, or the first mirror image, if it is good enough; otherwise the best of pi_i,
-        the stage-1 policy, the table, the policy that the first attempt continued from, and all attempts,
-        of which there are none with a table, or if nearly all is won. And how the training ended.
+        The first untrained policy, or the first mirror image, that is good enough; otherwise the best of the
+        untrained ones, the table, the policy that the first attempt continued from, and all attempts, of
+        which there are none with a table, or if nearly all is won. And how the training ended.
     """
     task, mode = ground.task, ground.mode
     tried: list[tuple[Score, ModePolicy]] = []
@@ -89,11 +89,9 @@ def retrain(
         tried.append((ground(policy), policy))
         return ground.suffices(policy)
 
-    if part is not None:
-        # Without a table only trainings could follow: the agent is tried unchanged, too.
-        for untrained in (part,) if held else (part, part.undivided):
-            if suffices(untrained):
-                return untrained, _result(ground, untrained, 0)
+    for given in untrained:
+        if suffices(given):
+            return given, _result(ground, given, 0)
     if image := mirror_image(ground, others):
         return image
     trainings = 0
