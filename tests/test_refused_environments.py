@@ -2,6 +2,7 @@
 
 import array
 import itertools
+import multiprocessing
 import random
 import re
 import sys
@@ -858,6 +859,34 @@ class Flagged(Flat):
         self.raised["flag"] = self.raised["flag"] or bool(self.data.qpos[0] > 1.4)
 
 
+class Raised(Flat):
+    """The more wins there were, in whatever process, the weaker are its motors."""
+
+    def __init__(self, level):
+        super().__init__()
+        self.level = level
+
+    def arrived(self, off):
+        self.level.value += off < 0.25
+        return off < 0.25
+
+    def control(self, action):
+        self.data.ctrl[:] = action * 0.9 ** min(self.level.value, 5)
+
+
+LEVEL = multiprocessing.Value("i", 0)
+
+
+class RaisedByAll(Raised):
+    def __init__(self):
+        super().__init__(LEVEL)
+
+
+def raised():
+    level = multiprocessing.Value("i", 0)
+    return lambda: Raised(level)
+
+
 MANY = np.random.default_rng(0).uniform((-1.8, 0.7), (1, 1.2), (30, 2))
 EVER = r"in a later one. It depends on .*resets .*{}.*; let reset"
 SHARED = "goes another way than a new one|all its instances share"
@@ -870,6 +899,8 @@ IN_RUNS = {
     "a denied place": (lambda: Denied, 0.15, r"step\(\) of Denied changes what|in the same state"),
     "an observer that remembers": (lambda: Latching, 0.3, r"docked|in the same state|differs by"),
     "an observer that judges": (lambda: Watching, 0.3, r"without the noise.* _get_obs\(\) has noted"),
+    "a level of all processes": (lambda: RaisedByAll, 0.0, r"module .*LEVEL\..*, which all its inst"),
+    "a level of all": (raised, 0.0, r"changes level\..*, which all its instances share"),
     "a flag of all": (lambda: Flagged, 0.0, r"class Flagged\.raised, which all its instances share"),
 }  # fmt: skip
 
@@ -883,6 +914,8 @@ IN_RUNS = {
         "an observer that remembers",
         "an observer that judges",
         "a flag of all",
+        "a level of all processes",
+        "a level of all",
         later("a curriculum in a bound method"),
         *map(later, ("a judge of resets without a seed", "a judge of sides")),
     ],

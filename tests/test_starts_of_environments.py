@@ -385,9 +385,9 @@ OTHERWISE = {
     "a rope": (Towing, XY, "tie the robot of Towing to something that stays"),
     "pins and a wrapper": (
         lambda: Moving(Puck()), {"pinned": {"qvel[0]": 0.0}},
-        r"wrapper of lambda moves the robot in its reset\(\)",
+        r"wrapper of lambda moves the robot in its reset\(\) after",
     ),
-    "a wrapper": (lambda: Moving(Puck()), {}, "let no wrapper move the robot in its reset"),
+    "a wrapper": (lambda: Moving(Puck()), {}, "let no wrapper move the robot after that"),
 }  # fmt: skip
 TABLE = OTHERWISE | {
     name: (make, given, rf"notes where it leads to \({what}")

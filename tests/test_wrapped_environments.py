@@ -355,6 +355,45 @@ ALIKE = {
 }  # fmt: skip
 
 
+class Halved(gym.Wrapper):
+    """Takes other actions, which a property tells, and stumbles over errors as its constructor asks for."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        np.seterr(over="raise")
+
+    @property
+    def action_space(self):
+        return spaces.Box(-1.0, 1.0, (2,), dtype=np.float64)
+
+    def step(self, action):
+        try:
+            return self.env.step(np.asarray(action) * np.exp(np.float64(999)))
+        except FloatingPointError:
+            return self.env.step(np.asarray(action) * 4.0)
+
+
+def test_a_wrapper_has_the_actions_and_the_context_of_its_own():
+    with np.errstate():
+        task = from_gymnasium(lambda: ClipAction(Halved(Flat())), steps=60)
+        assert task.input_limits[1].tolist() == [1.0, 1.0]
+        assert ends(task, pilot=lambda o: np.clip(pilot(o), -4, 4) / 4) == plain()
+
+
+class Portal(gym.Wrapper):
+    """Moves the robot, where it comes near the goal."""
+
+    def step(self, action):
+        result, place = self.env.step(action), self.unwrapped.data.qpos
+        place[0] += 0.05 * (place[0] > 1.2 and abs(place[1]) < 0.4)
+        return result
+
+
+def test_a_wrapper_that_seldom_moves_the_robot_after_a_step_is_refused_in_runs():
+    with pytest.raises(BadInput, match=r"moves the robot in its step\(\) after that of the env"):
+        outcomes(lambda: Portal(Flat()))
+
+
 @pytest.mark.parametrize("name", ALIKE)
 def test_runs_end_as_without(name):
     make, noise = ALIKE[name]

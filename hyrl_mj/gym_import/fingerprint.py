@@ -49,8 +49,6 @@ LIBRARIES = {
 DEEPEST, MOST = 10, 100_000
 GENERATORS = np.random.Generator, np.random.RandomState, np.random.BitGenerator, random.Random
 PLAIN = (type(None), bool, int, float, complex, str, bytes)
-# The kinds of variables of a class or a module whose values can change.
-DATA = (*PLAIN, list, dict, set, deque, tuple, np.ndarray, np.generic, *GENERATORS)
 FUNCTIONS = FunctionType | MethodType
 
 
@@ -225,9 +223,9 @@ def _parts(value: Any, path: str, found: Fingerprint, depth: int) -> dict[str, A
         return {path: value.detach().cpu().numpy()}
     if not hasattr(value, "__dict__"):
         try:
-            found[path] = pickle.dumps(value)
+            found[path] = memoryview(value).tobytes()  # of an array, also in shared memory
         except Exception:  # whatever a foreign class raises
-            found[path] = Unknown(id(value))
+            found[path] = _pickled(value)
         return {}
     state = object.__getstate__(value)  # with what a class keeps outside of `__dict__`, if it does
     slots = state[1] if isinstance(state, tuple) else {}
@@ -242,6 +240,13 @@ def _parts(value: Any, path: str, found: Fingerprint, depth: int) -> dict[str, A
         except Exception:  # it cannot be written down
             found[path] = Unknown(id(value))
     return {f"{path}.{name}" if path else name: part for name, part in {**own, **slots}.items()}
+
+
+def _pickled(value: Any) -> Any:
+    try:
+        return pickle.dumps(value)
+    except Exception:  # whatever a foreign class raises
+        return Unknown(id(value))
 
 
 @cache
@@ -347,10 +352,9 @@ def _compiled(code: CodeType) -> str:
 
 @cache
 def _data_of(owner: Any, size: int) -> list[str]:
-    """Returns the names of the variables of a class or module, of so many names, that can change."""
+    """Returns the names of the variables of a class or module, of so many names, that can remember."""
     return [
         name
         for name, value in vars(owner).items()
-        if not name.startswith("__")
-        and (isinstance(value, DATA) or is_of_torch(value, "Generator"))
+        if not (name.startswith("__") or has_no_memory(value))
     ]

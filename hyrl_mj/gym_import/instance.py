@@ -260,6 +260,12 @@ class Instance:
         self._like = self._like or self._begun
         return next(iter(written.differing(self._begun, self._like)), "")
 
+    def hands_on(self, other: Instance) -> str:
+        """Returns what has outlasted its episodes and is so in another one, too, "" if nothing is."""
+        worn = written.differing(self._begun, self._like or self._begun)
+        ours, theirs = self._begun, other._begun
+        return next((n for n in worn if n in ours and n in theirs and ours[n] == theirs[n]), "")
+
     def renew(self) -> str:
         """Leaves the episode before, and gets ready for another one.
 
@@ -292,16 +298,18 @@ class Instance:
             if noise is not None and noise.any():
                 self.observation = self._flat(self.displaced(noise))
             return
+        what = "step" if self.start is None else "reset"
+        own = self.physics.read() if self.start is None else self.start
         result = self._answer(noise)
+        if unlike(self.physics.read(), own)[self.spec.places].any():
+            raise BadInput(
+                f"a wrapper of {self.name} moves the robot in its {what}() after that of the environment, "
+                "whose noise, chart and ends are of the place before: let the environment itself do so"
+            )
         if self.start is None:
             self.take(result)
         else:
-            start, self.start, self.observation = self.start, None, self._flat(result)
-            if (self.physics.read() != start)[self.spec.places].any():
-                raise BadInput(
-                    f"a wrapper of {self.name} moves the robot in its reset(), so no run begins where it "
-                    "is put: let the reset of the environment itself do so"
-                )
+            self.start, self.observation = None, self._flat(result)
 
     def finish(self) -> None:
         """Refuses an episode in which random numbers were drawn, or what is shared or looked at changed."""
@@ -601,8 +609,10 @@ class Instance:
 def renewed(instance: Instance) -> Instance:
     """Returns what can play another run: an instance, or a new one if something outlasts its resets."""
     if instance.renew():
-        instance = Instance(instance.spec)
+        old, instance = instance, Instance(instance.spec)
         instance.renew()  # what it is like when it is new
+        if kept := old.hands_on(instance):
+            raise instance.sharing(kept)
     return instance
 
 

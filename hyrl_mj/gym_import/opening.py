@@ -293,9 +293,13 @@ def _checked(env: Any, name: str) -> mujoco.MjModel:
 
 def actions_of(env: gym.Env) -> Any:
     """Returns the space of the actions that an environment takes: that to which a ClipAction clips them."""
+    usual: Any = gym.Wrapper
     for layer in layers(env):
-        clips = isinstance(layer, gym.wrappers.ClipAction)
-        if not (clips or (isinstance(layer, gym.Wrapper) and layer._action_space is None)):
+        passes = isinstance(layer, gym.Wrapper) and layer._action_space is None
+        passes &= (
+            getattr(type(layer), "action_space", None) is usual.action_space
+        )  # no property of its own
+        if not (passes or isinstance(layer, gym.wrappers.ClipAction)):
             return layer.action_space
     return env.action_space
 

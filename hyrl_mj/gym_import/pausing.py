@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable
+from contextvars import Context, copy_context
 from queue import SimpleQueue
 from threading import Thread
 from typing import Any
@@ -11,6 +12,8 @@ from typing import Any
 
 class Pausing:
     """A thread that runs one function after another, each of which may pause until it is told to go on.
+
+    What its maker has set in its context holds there, too, as by `numpy.seterr`, or `decimal`'s precision.
 
     Attributes:
         busy: whether a function has begun and not ended.
@@ -21,7 +24,8 @@ class Pausing:
         self._work: SimpleQueue[Callable[[], Any] | None] = SimpleQueue()
         self._answers: SimpleQueue[Any] = SimpleQueue()
         self._news: SimpleQueue[tuple[str, Any]] = SimpleQueue()
-        Thread(target=_serve, args=(self._work, self._news), daemon=True).start()
+        given = self._work, self._news, copy_context()
+        Thread(target=_serve, args=given, daemon=True).start()
         weakref.finalize(self, self._work.put, None)  # the thread ends with its owner
 
     def begin(self, function: Callable[[], Any]) -> Any:
@@ -49,11 +53,11 @@ class Pausing:
         return value
 
 
-def _serve(work: SimpleQueue[Any], news: SimpleQueue[Any]) -> None:
+def _serve(work: SimpleQueue[Any], news: SimpleQueue[Any], context: Context) -> None:
     """Does what is asked for in turn, until that is None; it holds on to nothing in between."""
     while (job := work.get()) is not None:
         try:
-            news.put(("done", job()))
+            news.put(("done", context.run(job)))
         except BaseException as error:
             news.put(("error", error))
         del job

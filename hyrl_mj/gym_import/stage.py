@@ -260,11 +260,15 @@ class Stage:
 
     def _renewed(self, spare: list[Instance], real: bool = False) -> Instance:
         """Returns an instance that can begin an episode: a spare one, or a new one if these are worn."""
+        old = None
         while True:
             instance = spare.pop() if spare else self._new(real)
-            if not (worn := instance.renew()):
+            worn = instance.renew()
+            if old and (kept := old.hands_on(instance)):  # as in shared memory, or in a file
+                raise instance.sharing(kept)
+            if not worn:
                 return instance
-            self._wears = True
+            self._wears, old = True, instance
             if written.is_shared(worn):
                 raise instance.sharing(worn)
 

@@ -47,7 +47,7 @@ def observers_of(instance: Instance) -> tuple[str, ...]:
             f"{instance.name} has no method that computes what it observes in its present state, so nothing "
             "is known of what it would observe under noise: give it one named _get_obs, without arguments, "
             "whose answer step() and reset() return as it is; let reset() call mj_forward before it "
-            "observes, and let no wrapper move the robot in its reset()"
+            "observes, and let no wrapper move the robot after that"
         )
     return tuple(left)
 
