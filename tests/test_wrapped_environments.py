@@ -2,6 +2,7 @@
 
 import copy
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
@@ -392,6 +393,35 @@ class Portal(gym.Wrapper):
 def test_a_wrapper_that_seldom_moves_the_robot_after_a_step_is_refused_in_runs():
     with pytest.raises(BadInput, match=r"moves the robot in its step\(\) after that of the env"):
         outcomes(lambda: Portal(Flat()))
+
+
+class Endless(gym.Wrapper):
+    """Takes all ends away."""
+
+    def step(self, action):
+        observation, reward, _, _, info = self.env.step(action)
+        return observation, reward, False, False, info
+
+
+def test_a_time_limit_whose_end_a_wrapper_takes_away_is_refused_in_runs():
+    with pytest.raises(BadInput, match="goes on after the 20 steps of its TimeLimit"):
+        outcomes(lambda: Endless(TimeLimit(Flat(), 20)), steps=None)
+    assert outcomes(lambda: Endless(TimeLimit(Flat(), 20))) == plain()
+
+
+class Pooled(Flat):
+    """Steps in a thread of its own, as each instance has one, which outlasts resets."""
+
+    def __init__(self):
+        super().__init__()
+        self.threads = ThreadPoolExecutor(1)
+
+    def control(self, action):
+        self.threads.submit(super().control, action).result()
+
+
+def test_what_each_instance_has_of_its_own_may_outlast_resets():
+    assert outcomes(Pooled) == plain()
 
 
 @pytest.mark.parametrize("name", ALIKE)

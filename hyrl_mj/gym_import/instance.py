@@ -260,12 +260,6 @@ class Instance:
         self._like = self._like or self._begun
         return next(iter(written.differing(self._begun, self._like)), "")
 
-    def hands_on(self, other: Instance) -> str:
-        """Returns what has outlasted its episodes and is so in another one, too, "" if nothing is."""
-        worn = written.differing(self._begun, self._like or self._begun)
-        ours, theirs = self._begun, other._begun
-        return next((n for n in worn if n in ours and n in theirs and ours[n] == theirs[n]), "")
-
     def renew(self) -> str:
         """Leaves the episode before, and gets ready for another one.
 
@@ -608,12 +602,21 @@ class Instance:
 
 def renewed(instance: Instance) -> Instance:
     """Returns what can play another run: an instance, or a new one if something outlasts its resets."""
-    if instance.renew():
-        old, instance = instance, Instance(instance.spec)
-        instance.renew()  # what it is like when it is new
-        if kept := old.hands_on(instance):
-            raise instance.sharing(kept)
-    return instance
+    return begun(Instance(instance.spec), instance) if instance.renew() else instance
+
+
+def begun(new: Instance, worn: Instance | None) -> Instance:
+    """Returns a new instance after its first reset.
+
+    Raises:
+        BadInput: what has outlasted episodes of a worn one is in it, too, as from shared memory or a file.
+    """
+    new.renew()
+    now, before = (worn._begun, worn._like) if worn and worn._like else (new._begun, new._begun)
+    for name in written.differing(now, before):
+        if name in now and name in new._begun and now[name] == new._begun[name]:
+            raise new.sharing(name)
+    return new
 
 
 def to_end(run: Iterable[Seen]) -> Iterator[Seen]:

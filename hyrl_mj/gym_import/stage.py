@@ -13,13 +13,15 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from gymnasium.wrappers import TimeLimit
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.files import trust
 from hyrl_mj.gym_import import fingerprint as written
 from hyrl_mj.gym_import.coordinates import own_of
-from hyrl_mj.gym_import.instance import OF_STATE, Instance, Passed, outlasting
+from hyrl_mj.gym_import.instance import OF_STATE, Instance, Passed, begun, outlasting
 from hyrl_mj.gym_import.observations import unlike
+from hyrl_mj.gym_import.opening import layers
 from hyrl_mj.gym_import.specification import EnvironmentSpec
 from hyrl_mj.system import limits
 from hyrl_mj.tasks import Outcome
@@ -261,16 +263,14 @@ class Stage:
     def _renewed(self, spare: list[Instance], real: bool = False) -> Instance:
         """Returns an instance that can begin an episode: a spare one, or a new one if these are worn."""
         old = None
-        while True:
-            instance = spare.pop() if spare else self._new(real)
-            worn = instance.renew()
-            if old and (kept := old.hands_on(instance)):  # as in shared memory, or in a file
-                raise instance.sharing(kept)
-            if not worn:
-                return instance
-            self._wears, old = True, instance
+        while spare:
+            old = spare.pop()
+            if not (worn := old.renew()):
+                return old
+            self._wears = True
             if written.is_shared(worn):
-                raise instance.sharing(worn)
+                raise old.sharing(worn)
+        return begun(self._new(real), old)
 
     def _new(self, real: bool) -> Instance:
         instance = Instance(self.spec, real)
@@ -328,6 +328,12 @@ def judge(run: Played, real: Instance, noise: np.ndarray, fresh: Instance | None
         _compare(real, "reward", run.rewards, told[:, :1])
     if run.outcome == Outcome.UNSTABLE:
         return
+    over = run.cut and len(run.inputs) == spec.max_steps
+    if over and not told[-1, 1:3].any() and any(isinstance(o, TimeLimit) for o in layers(real.env)):
+        raise BadInput(
+            f"{real.name} goes on after the {spec.max_steps} steps of its TimeLimit, whose end a wrapper "
+            "around it takes away: give it steps"
+        )
     success, ends = spec.criterion.judged(told)
     if run.cut and ends[-1] == Outcome.RUNNING:
         ends[-1] = spec.criterion.verdict(success[-1:])[0]
