@@ -92,6 +92,12 @@ def test_a_closed_loop_of_many_runs_notices_what_begins_later(vehicle):
         simulate(vehicle, agent, starts_of_vehicle(300), Noise("uniform", 0.1))
 
 
+def test_a_closed_loop_notices_who_answers_otherwise_alone(vehicle):
+    agent = hyrl_mj.from_callable(lambda o: turning(o) * (len(o) > 1), vehicle)
+    with pytest.raises(BadInput, match=r"the function answers .* and, alone, with"):
+        simulate(vehicle, agent, starts_of_vehicle(20), Noise("uniform", 0.1))
+
+
 class Plain:
     """A policy of the user's own, which changes what it should not."""
 

@@ -317,7 +317,7 @@ class Asked:
         return answered
 
     def again(self) -> None:
-        """Asks about these measurements again, later ones first, and about a few of each at once.
+        """Asks about these measurements again, later ones first, about a few of each at once, and one alone.
 
         Raises:
             BadInput: an answer is another one.
@@ -337,6 +337,8 @@ class Asked:
         if self._few:
             *asked, first = map(np.concatenate, zip(*self._few, strict=True))
             compare(name, ask, asked, first, span, f"in a batch of {len(first)}", again=False)
+            alone = [values[-1:] for values in asked]
+            compare(name, ask, alone, first[-1:], span, "alone", again=False)
 
 
 def _beside(answered: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
