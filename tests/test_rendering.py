@@ -126,6 +126,7 @@ def test_what_reaches_past_the_camera_is_not_left_out(projection):
     assert (red > green + blue).any()
     assert (green > red + blue).any()
     assert (blue > red + green).any()
+    assert (whole[0, -1] == 255).all()  # where there is no skybox
     assert (np.abs(parts.astype(int) - whole).max(axis=-1) > 1).sum() <= 5
 
 

@@ -161,6 +161,7 @@ class SceneRenderer:
         self.data = mujoco.MjData(self.model)
         self.scene = mujoco.MjvScene(self.model, maxgeom=geoms)
         self._options, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
+        self._sky: mujoco.MjvGeom | None = None
         # The geoms that stay: their types, bounding spheres, and whether they are shown.
         self._kinds: list[int] = []
         self._balls, self._shown = np.empty((0, 4)), np.empty(0, dtype=bool)
@@ -176,8 +177,26 @@ class SceneRenderer:
         model, data, static = self.model, self.data, mujoco.mjtCatBit.mjCAT_STATIC.value
         mujoco.mj_forward(model, data)
         mujoco.mjv_updateScene(model, data, self._options, None, self._camera, static, self.scene)
+        self._sky = (
+            None if mujoco.mjtTexture.mjTEXTURE_SKYBOX in model.tex_type else self._add_sky()
+        )
         self._kinds, self._balls, self._shown = [], self._balls[:0], self._shown[:0]
         self.keep()
+
+    def _add_sky(self) -> mujoco.MjvGeom:
+        """Adds a white sphere about the camera: without a skybox dark marks are drawn on black."""
+        sky = self.scene.geoms[self.scene.ngeom]
+        size = np.full(3, 0.9 * self.model.vis.map.zfar * self.model.stat.extent)
+        white = np.ones(4, dtype=np.float32)
+        mujoco.mjv_initGeom(
+            sky, mujoco.mjtGeom.mjGEOM_SPHERE, size, np.zeros(3), np.eye(3).ravel(), white
+        )
+        # MuJoCo leaves the number of the model's geom that was drawn in this place before.
+        sky.objtype, sky.objid = mujoco.mjtObj.mjOBJ_UNKNOWN, -1
+        sky.emission, sky.specular, sky.category = 1, 0, mujoco.mjtCatBit.mjCAT_DECOR
+        self.scene.flags[mujoco.mjtRndFlag.mjRND_CULL_FACE] = False  # it is seen from inside
+        self.scene.ngeom += 1
+        return sky
 
     def keep(self) -> None:
         """Makes the geoms that are in the scene now permanent."""
@@ -206,6 +225,8 @@ class SceneRenderer:
         self._move(qpos)
         mujoco.mjv_updateCamera(self.model, self.data, self._camera, self.scene)
         mujoco.mjv_makeLights(self.model, self.data, self.scene)
+        if self._sky is not None:
+            self._sky.pos = self.scene.camera[0].pos
         wider = self.widening * max(self.height / self.width, 1.0)
         shape = self.width / self.height
         for view in self.scene.camera:
