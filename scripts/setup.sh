@@ -34,6 +34,7 @@ if [ "$(uname)" = Linux ]; then
     [ "${2:-}" != browser ] || command -v chromium >/dev/null || apt_install chromium ||
       echo "The report is not looked at in a browser: apt-get install chromium as root."
   } &
+  trap wait EXIT # whatever goes wrong meanwhile
 fi
 
 venv="${HYRL_MJ_VENV:-.venv}"
@@ -54,4 +55,5 @@ echo "Installing hyrl_mj into $venv (a minute or two the first time) ..."
 # Python compiles what it imports, and most of what is installed is never imported.
 "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --no-compile --editable "$1"
 wait
+trap - EXIT
 PATH="$(cd "$venv/bin" && pwd):$PATH"

@@ -125,6 +125,8 @@ def test_marks_of_a_point_in_the_floor_lie_on_it(puck):
     low.model = deepcopy(puck.model)
     low.model.site("tracked").pos[2] = -0.3
     assert tracked_points(low, np.zeros((1, 2)))[0, 2] == -2 * ON_FLOOR
+    low.model.geom("floor").quat[:] = np.cos(0.2), 0.0, np.sin(0.2), 0.0
+    assert tracked_points(low, np.zeros((1, 2)))[0, 2] < -0.2  # a ramp is below it elsewhere
 
 
 def test_where_there_is_no_critical_set_there_is_none_in_the_plane(cube):

@@ -7,12 +7,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from environments import Puck, Slid, puck_agent
-from planted import ChartPolicy, extended, one_way_policy, spare_environments
+from planted import ChartPolicy, extended, spare_environments
 
 from hyrl_mj import BadArtifact, from_gymnasium
 from hyrl_mj.judging.game import Lattice, lattice_grid
 from hyrl_mj.judging.worst_case import worst_case
-from hyrl_mj.learning import preset
+from hyrl_mj.learning import preset, training
 from hyrl_mj.pipeline.steps import _retrained
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.sets import Grid, GridSet
@@ -235,7 +235,7 @@ def test_the_best_of_what_is_given_is_taken_and_nothing_is_trained(
     assert (part.act(plant.measurement) != own).any()
 
 
-@pytest.mark.parametrize(("modes", "tried"), [(1, ["agent"]), (2, [])])
+@pytest.mark.parametrize(("modes", "tried"), [(1, ["policy"]), (2, [])])
 def test_the_policy_of_stage_1_is_tried_first_where_nothing_is_decided(
     modes, tried, vehicle, monkeypatch, tmp_path
 ):
@@ -243,12 +243,13 @@ def test_the_policy_of_stage_1_is_tried_first_where_nothing_is_decided(
     every = np.ones(grid.size, dtype=bool)
     sets = of_masks(grid, *[every] * modes)
     partition = Partition(sets.modes, tuple(sets.sets), every)
-    policy, settings = one_way_policy(vehicle), preset(vehicle, "smoke")
+    settings = preset(vehicle, "smoke")
+    policy = training.export(training.build(vehicle, settings.stage6, seed=0), vehicle)
     grounds = partial(mode_ground, vehicle, sets)
 
     def retrained(ground, *given, untrained, **more):
-        assert all(one.policy is policy and one.whole for one in untrained)
-        return ["agent" for _ in untrained]
+        assert all(one is policy for one in untrained)  # which can be bounded, and exported
+        return ["policy" for _ in untrained]
 
     monkeypatch.setattr("hyrl_mj.stages.retraining.retrain", retrained)
     assert _retrained(grounds, None, settings, policy, partition, tmp_path, 0) == tried

@@ -1,7 +1,9 @@
 """Wrappers, noise and ends: episodes are played as the environment plays them, or it is refused by name."""
 
+import abc
 import copy
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
@@ -403,9 +405,10 @@ class Endless(gym.Wrapper):
         return observation, reward, False, False, info
 
 
-def test_a_time_limit_whose_end_a_wrapper_takes_away_is_refused_in_runs():
+@pytest.mark.parametrize("success", [None, "truncated"])
+def test_a_time_limit_whose_end_a_wrapper_takes_away_is_refused_in_runs(success):
     with pytest.raises(BadInput, match="goes on after the 20 steps of its TimeLimit"):
-        outcomes(lambda: Endless(TimeLimit(Flat(), 20)), steps=None)
+        outcomes(lambda: Endless(TimeLimit(Flat(), 20)), steps=None, success=success)
     assert outcomes(lambda: Endless(TimeLimit(Flat(), 20))) == plain()
 
 
@@ -420,8 +423,35 @@ class Pooled(Flat):
         self.threads.submit(super().control, action).result()
 
 
+class Clocked(Flat):
+    """Notes the second in which it was reset, which two instances may have in common."""
+
+    def reset(self, **given):
+        self.began = int(time.time())
+        return super().reset(**given)
+
+
+class Helped(Flat, abc.ABC):
+    """Has methods that need no instance."""
+
+    @staticmethod
+    def same(off):
+        return off
+
+    @classmethod
+    def near(cls, off):
+        return off < 0.25
+
+    def arrived(self, off):
+        return self.near(self.same(off))
+
+
 def test_what_each_instance_has_of_its_own_may_outlast_resets():
-    assert outcomes(Pooled) == plain()
+    assert outcomes(Pooled) == outcomes(Clocked) == plain()
+
+
+def test_methods_that_need_no_instance_are_no_memory():
+    assert from_gymnasium(Helped, steps=20).specification.memoryless
 
 
 @pytest.mark.parametrize("name", ALIKE)

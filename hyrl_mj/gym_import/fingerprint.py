@@ -14,11 +14,15 @@ import os
 import pickle
 import random
 import sys
+from array import array
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Set
 from contextlib import suppress
+from ctypes import c_int
 from dataclasses import dataclass
 from functools import cache, partial
+from mmap import mmap
+from multiprocessing.sharedctypes import SynchronizedBase
 from operator import attrgetter
 from pathlib import Path
 from types import BuiltinFunctionType, CodeType, FunctionType, MethodType, ModuleType
@@ -49,6 +53,9 @@ LIBRARIES = {
 DEEPEST, MOST = 10, 100_000
 GENERATORS = np.random.Generator, np.random.RandomState, np.random.BitGenerator, random.Random
 PLAIN = (type(None), bool, int, float, complex, str, bytes)
+# The kinds of variables of a class or a module whose values can change, those of C and of shared memory, too.
+SHARED = (array, bytearray, mmap, c_int.__mro__[2], SynchronizedBase)
+DATA = (*PLAIN, list, dict, set, deque, tuple, np.ndarray, np.generic, *GENERATORS, *SHARED)
 FUNCTIONS = FunctionType | MethodType
 
 
@@ -352,9 +359,10 @@ def _compiled(code: CodeType) -> str:
 
 @cache
 def _data_of(owner: Any, size: int) -> list[str]:
-    """Returns the names of the variables of a class or module, of so many names, that can remember."""
+    """Returns the names of the variables of a class or module, of so many names, that can change."""
     return [
         name
         for name, value in vars(owner).items()
-        if not (name.startswith("__") or has_no_memory(value))
+        if not name.startswith("__")
+        and (isinstance(value, DATA) or is_of_torch(value, "Generator"))
     ]

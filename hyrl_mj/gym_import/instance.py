@@ -11,6 +11,7 @@ import copy
 import math
 import random
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -60,6 +61,7 @@ class Passed(NamedTuple):
 
 # What is put before names of parts of MuJoCo's state, among those of what is remembered.
 OF_STATE = "MuJoCo's "
+TICK = 1.1  # after that a clock in whole seconds has gone on [s]
 
 
 class Instance:
@@ -97,7 +99,7 @@ class Instance:
         physics = physics_of(env)
         assert physics is not None
         self.spec, self.name, self.steps = spec, spec.name, steps_of(env)
-        as_it_is = real and spec.description.steps is None
+        self._as_it_is = as_it_is = real and spec.description.steps is None
         names = [type(one).__name__ for one in layers(env)]
         self.env, (self.model, self.data) = env if as_it_is else peeled(env), physics
         self.physics = Physics(self.model, self.data)
@@ -260,6 +262,12 @@ class Instance:
         self._like = self._like or self._begun
         return next(iter(written.differing(self._begun, self._like)), "")
 
+    def handed_on(self, new: Instance) -> list[str]:
+        """Returns the names of what has outlasted episodes of this one, and is so in a new one, too."""
+        now, then = self._begun, new._begun
+        worn = written.differing(now, self._like or now)
+        return [name for name in worn if name in now and name in then and now[name] == then[name]]
+
     def renew(self) -> str:
         """Leaves the episode before, and gets ready for another one.
 
@@ -298,7 +306,7 @@ class Instance:
         if unlike(self.physics.read(), own)[self.spec.places].any():
             raise BadInput(
                 f"a wrapper of {self.name} moves the robot in its {what}() after that of the environment, "
-                "whose noise, chart and ends are of the place before: let the environment itself do so"
+                "and noise and the chart are taken before: let the environment itself do so"
             )
         if self.start is None:
             self.take(result)
@@ -557,6 +565,7 @@ class Instance:
         self.observation = self._flat(observation)
         # The limit of `steps`, or that of a wrapper which episodes are played without.
         over = self._samples == self.spec.max_steps and "truncated" in self.spec.criterion.asked
+        over &= not self._as_it_is
         truncated = bool(truncated) or over
         touch = bool(terminated) and bool(
             self.physics.touched(self.spec.solid) - self.spec.harmless
@@ -612,10 +621,13 @@ def begun(new: Instance, worn: Instance | None) -> Instance:
         BadInput: what has outlasted episodes of a worn one is in it, too, as from shared memory or a file.
     """
     new.renew()
-    now, before = (worn._begun, worn._like) if worn and worn._like else (new._begun, new._begun)
-    for name in written.differing(now, before):
-        if name in now and name in new._begun and now[name] == new._begun[name]:
-            raise new.sharing(name)
+    if worn and worn._like and (kept := worn.handed_on(new)):
+        time.sleep(TICK)  # a clock has gone on then
+        another = Instance(new.spec)
+        another.renew()
+        for name in kept:
+            if name in worn.handed_on(another):
+                raise new.sharing(name)
     return new
 
 

@@ -296,9 +296,8 @@ def actions_of(env: gym.Env) -> Any:
     usual: Any = gym.Wrapper
     for layer in layers(env):
         passes = isinstance(layer, gym.Wrapper) and layer._action_space is None
-        passes &= (
-            getattr(type(layer), "action_space", None) is usual.action_space
-        )  # no property of its own
+        if passes:  # unless it has a property of its own
+            passes = getattr(type(layer), "action_space", None) is usual.action_space
         if not (passes or isinstance(layer, gym.wrappers.ClipAction)):
             return layer.action_space
     return env.action_space

@@ -332,7 +332,7 @@ def judge(run: Played, real: Instance, noise: np.ndarray, fresh: Instance | None
     if over and not told[-1, 1:3].any() and any(isinstance(o, TimeLimit) for o in layers(real.env)):
         raise BadInput(
             f"{real.name} goes on after the {spec.max_steps} steps of its TimeLimit, whose end a wrapper "
-            "around it takes away: give it steps"
+            "around it takes away: give steps, the number of samples of an episode"
         )
     success, ends = spec.criterion.judged(told)
     if run.cut and ends[-1] == Outcome.RUNNING:

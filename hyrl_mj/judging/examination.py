@@ -48,7 +48,7 @@ class ExamineOptions(Checked):
     all_coordinates: bool = False
     near_critical: bool = False
     seed: Annotated[int, By(check_seed)] = 0
-    attack_starts: Annotated[int | None, Optional(Integer(1, 100_000))] = None
+    attack_starts: Annotated[int | None, Optional(Integer(1, 10_000))] = None
     attack_seconds: Annotated[float | None, Optional(Number(0, 86_400, above=True))] = None
     attack_rounds: Annotated[int | None, Optional(Integer(1, 100_000))] = None
 

@@ -75,7 +75,7 @@ def share_sentence(score: Score) -> str:
 # What the policy of a mode is, unless it was trained.
 POLICIES = {
     "pi_i": ", the agent as on its own side of M*,",
-    "agent": ", that of stage 1 itself,",
+    "agent": ", the agent itself,",
     "table": ", a table of inputs,",
 }
 

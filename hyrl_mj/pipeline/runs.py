@@ -233,7 +233,7 @@ def usable_task(task: str | Path | Task) -> Task:
     found = get_task(task)
     if found is task:
         check_as_made(found)
-    return found if is_of_this_package(found) else check_task(found)
+    return check_task(found, played=not is_of_this_package(found))
 
 
 def extend_again(run: directory.Run, horizon: float, say: Say = print) -> Run:
@@ -261,9 +261,9 @@ def _run_all(
     s = run.settings
     if not run.manifest.is_done("train"):
         task = run.task
-        cautions = [hidden_goal(task, s.eps, s.everywhere)]
+        cautions = [torn(task), overlooked(task), hidden_goal(task, s.eps, s.everywhere)]
         if not is_of_this_package(task):
-            cautions += [torn(task), overlooked(task), jumped_over(task)]
+            cautions.append(jumped_over(task))
         for caution in filter(None, cautions):
             say(caution)
     if "partition" in stages and not run.manifest.is_done("partition"):

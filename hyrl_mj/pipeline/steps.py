@@ -199,12 +199,14 @@ def _retrained(
     """Trains the policy of one mode, which may happen in a process of a pool."""
     from hyrl_mj.stages.retraining import retrain, start_policy
 
-    ground, untrained = grounds(mode), []
+    ground = grounds(mode)
+    untrained: list[ModePolicy] = []
     attacked = ground.task.effort.attacked
     if attacked or len(ground.extended.modes) == 1:  # or nothing is to be decided
         part = part_policies(ground.task, policy, partition, ground.extended.eps)[mode]
         # Without a table only trainings could follow: the first policy is tried unchanged, too.
-        untrained = [part] * attacked + [part.undivided] * (held is None)
+        whole = policy if isinstance(policy, MlpPolicy) and not attacked else part.undivided
+        untrained = [*[part] * attacked, *[whole] * (held is None)]
     return retrain(
         ground,
         s.stage6,

@@ -131,9 +131,9 @@ def mirror_image(
 def with_later_images(
     done: Sequence[tuple[ModePolicy, ModeResult]], grounds: Grounds, settings: Training
 ) -> list[tuple[ModePolicy, ModeResult]]:
-    """Returns the policies of all modes, in which mirror images stand for those that are not good enough.
+    """Returns the policies of all modes, some of which are mirror images of later ones.
 
-    A mode that has made all of its trainings in vain takes the image of a later one, if that is.
+    A mode takes such an image that is good enough, if it has made all of its trainings and is not.
     """
     found = list(done)
     for i, (policy, result) in enumerate(done):

@@ -120,7 +120,7 @@ def get_task(name: str | Path | Task) -> Task:
 
 
 def is_of_this_package(task: Task) -> bool:
-    """Returns whether a task is one of this package, which its tests have tried already."""
+    """Returns whether a task is one of this package, whose episodes its tests have played."""
     return type(task).__module__.startswith("hyrl_mj.tasks.")
 
 

@@ -499,7 +499,8 @@ def _check_seam(task: Task, before: np.ndarray, after: np.ndarray) -> None:
             row = int(leap.argmax())
             raise BadInput(
                 f"within one sample {chart.names[axis]} leaps from {before[row, axis]:.3g} to "
-                f"{after[row, axis]:.3g} {unit}: say in the chart that it is periodic"
+                f"{after[row, axis]:.3g} {unit}: say in the chart that it is periodic, or, if it "
+                "turns that fast, make the sample time shorter"
             )
 
 

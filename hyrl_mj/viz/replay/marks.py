@@ -98,7 +98,8 @@ def tracked_points(task: Task, qpos: np.ndarray) -> np.ndarray:
     for point, position in zip(points, qpos, strict=True):
         mjcf.place(task.model, data, position, task.mocap)
         point[:] = getattr(data, kind)[number]
-    points[:, 2] = np.maximum(points[:, 2], _ground(task) - 2 * ON_FLOOR)
+    if _is_level(task):
+        points[:, 2] = np.maximum(points[:, 2], _ground(task) - 2 * ON_FLOOR)
     return points
 
 
@@ -106,6 +107,15 @@ def _ground(task: Task) -> float:
     """Returns the height of the geom "floor" [m], -inf if there is none."""
     floor = mujoco.mj_name2id(task.model, mujoco.mjtObj.mjOBJ_GEOM, "floor")
     return -np.inf if floor < 0 else float(task.model.geom_pos[floor, 2])
+
+
+def _is_level(task: Task) -> bool:
+    """Returns whether the geom "floor" is a level plane of the world."""
+    model = task.model
+    floor = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, "floor")
+    is_plane = floor >= 0 and model.geom_type[floor] == mujoco.mjtGeom.mjGEOM_PLANE
+    # It may be turned about the vertical alone.
+    return is_plane and not model.geom_bodyid[floor] and not model.geom_quat[floor, 1:3].any()
 
 
 @dataclass(frozen=True)
