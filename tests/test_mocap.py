@@ -258,7 +258,7 @@ def test_a_picture_shows_them_at_the_phase(swing):
     for phase in (-1.2, 0.0, 1.2):
         renderer.place(np.array([-5.0, 0.0, phase]), "overhead")
         picture = renderer.draw().astype(int)
-        red = (picture[..., 0] > 80) & (picture[..., 1:].max(axis=-1) < 60)
+        red = picture[..., 0] - picture[..., 1:].max(axis=-1) > 60
         across[phase] = 60 - np.argwhere(red)[:, 0].mean()
     renderer.close()
     pixels = 0.5 * np.sin(1.2) * 120 / 3

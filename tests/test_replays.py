@@ -316,7 +316,7 @@ def test_a_task_with_a_memory_or_a_view_of_others_is_refused_by_name(kind, told)
 def test_a_run_of_such_a_task_is_refused_before_it_trains(kind, tmp_path, monkeypatch):
     with pytest.raises(BadInput, match="vehicle is not simulated as MuJoCo alone simulates it"):
         judge_task(kind())
-    monkeypatch.setattr("hyrl_mj.pipeline.runs.check_task", lambda task: task)
+    monkeypatch.setattr("hyrl_mj.pipeline.runs.check_task", lambda task, played: task)
     monkeypatch.setattr(hyrl_mj.runs.directory.Run, "task", kind())
     with pytest.raises(BadInput, match="something keeps a memory between episodes or copies"):
         hyrl_mj.run("vehicle", preset="smoke", out=tmp_path / "run")
