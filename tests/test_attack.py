@@ -94,7 +94,7 @@ OPENED = {
         "trust.output = lambda *paths, force=False: nullcontext()",
     ),
     "a sentence without end": (
-        "^arguments", 44, "a sentence of", "from hyrl_mj import errors; errors.LONGEST = 10**9",
+        "^spec", 92, "a sentence of", "from hyrl_mj import errors; errors.LONGEST = 10**9",
     ),
     "a model without limits": (
         "^model", 46, "exit status -11|hangs",
