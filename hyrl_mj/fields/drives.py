@@ -191,9 +191,9 @@ def _checked(task: Driving, arcs: Iterable[HybridArc]) -> list[HybridArc]:
             rows = {name: getattr(arc, name)[:end].copy() for name in names}
             rows["measured"][-1] = rows["u"][-1] = np.nan
             arc = replace(arc, outcome="crashed", **rows)
-        last = task.measured_at(arc.z[-1:, :3], arc.t[-1:], np.zeros(1, dtype=int))
-        if arc.outcome == "stalled" and task.waits(last)[0]:
-            arc = replace(arc, outcome="waited")
+        if arc.outcome == "stalled":
+            last = task.measured_at(arc.z[-1:, :3], arc.t[-1:], np.zeros(1, dtype=int))
+            arc = replace(arc, outcome="waited") if task.waits(last)[0] else arc
         checked.append(arc)
     return checked
 

@@ -53,8 +53,9 @@ LIBRARIES = {
 DEEPEST, MOST = 10, 100_000
 GENERATORS = np.random.Generator, np.random.RandomState, np.random.BitGenerator, random.Random
 PLAIN = (type(None), bool, int, float, complex, str, bytes)
-# The kinds of variables of a class or a module whose values can change, those of C and of shared memory, too.
+# Values of C, which processes may share: of `ctypes`, by the class of all of them, and of `multiprocessing`.
 SHARED = (array, bytearray, mmap, c_int.__mro__[2], SynchronizedBase)
+# The kinds of variables of a class or a module whose values can change.
 DATA = (*PLAIN, list, dict, set, deque, tuple, np.ndarray, np.generic, *GENERATORS, *SHARED)
 FUNCTIONS = FunctionType | MethodType
 

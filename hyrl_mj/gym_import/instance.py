@@ -99,9 +99,9 @@ class Instance:
         physics = physics_of(env)
         assert physics is not None
         self.spec, self.name, self.steps = spec, spec.name, steps_of(env)
-        self._as_it_is = as_it_is = real and spec.description.steps is None
+        self._as_it_is = real and spec.description.steps is None
         names = [type(one).__name__ for one in layers(env)]
-        self.env, (self.model, self.data) = env if as_it_is else peeled(env), physics
+        self.env, (self.model, self.data) = env if self._as_it_is else peeled(env), physics
         self.physics = Physics(self.model, self.data)
         self.inner: Any = self.env.unwrapped
         kept = [type(one).__name__ for one in layers(self.env)]
@@ -564,8 +564,8 @@ class Instance:
         observation, reward, terminated, truncated, info = result
         self.observation = self._flat(observation)
         # The limit of `steps`, or that of a wrapper which episodes are played without.
-        over = self._samples == self.spec.max_steps and "truncated" in self.spec.criterion.asked
-        over &= not self._as_it_is
+        over = self._samples == self.spec.max_steps and not self._as_it_is
+        over &= "truncated" in self.spec.criterion.asked
         truncated = bool(truncated) or over
         touch = bool(terminated) and bool(
             self.physics.touched(self.spec.solid) - self.spec.harmless

@@ -204,9 +204,13 @@ def _retrained(
     attacked = ground.task.effort.attacked
     if attacked or len(ground.extended.modes) == 1:  # or nothing is to be decided
         part = part_policies(ground.task, policy, partition, ground.extended.eps)[mode]
-        # Without a table only trainings could follow: the first policy is tried unchanged, too.
-        whole = policy if isinstance(policy, MlpPolicy) and not attacked else part.undivided
-        untrained = [*[part] * attacked, *[whole] * (held is None)]
+        if attacked:
+            untrained.append(part)
+        if held is None:  # only trainings could follow: the first policy is tried unchanged, too
+            if isinstance(policy, MlpPolicy) and not attacked:
+                untrained.append(policy)
+            else:
+                untrained.append(part.undivided)
     return retrain(
         ground,
         s.stage6,

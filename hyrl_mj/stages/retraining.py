@@ -137,8 +137,11 @@ def with_later_images(
     """
     found = list(done)
     for i, (policy, result) in enumerate(done):
-        if result.attempts == settings.attempts and not grounds(result.mode).suffices(policy):
-            found[i] = mirror_image(grounds(result.mode), done[i + 1 :]) or found[i]
+        later = done[i + 1 :]
+        if later and result.attempts == settings.attempts:
+            ground = grounds(result.mode)
+            if not ground.suffices(policy):
+                found[i] = mirror_image(ground, later) or found[i]
     return found
 
 

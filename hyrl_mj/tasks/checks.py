@@ -114,7 +114,7 @@ def overlooked(task: Task) -> str:
 
 def torn(task: Task) -> str:
     """Returns where `state` puts a robot that an equality constraint then pulls together; "" if nowhere."""
-    model, chart, worst = task.model, task.chart, ("", TORN)
+    model, chart, found = task.model, task.chart, []
     if type(task).plant is not Task.plant or not model.neq:
         return ""
     z, data = chart.draw(STARTS, np.random.default_rng(0)), mujoco.MjData(model)
@@ -123,18 +123,16 @@ def torn(task: Task) -> str:
         mjcf.place(model, data, qpos, task.mocap)
         mujoco.mj_fwdPosition(model, data)
         off = np.abs(data.efc_pos[: data.ne])
-        if off.max(initial=0.0) > worst[1]:
-            number = data.efc_id[off.argmax()]
-            name = model.equality(number).name or f"equality constraint {number}"
-            worst = (
-                f"{name} is off by {off.max():.2g} (m or rad), as at {chart.format(point)}",
-                float(off.max()),
-            )
-    if not worst[0]:
+        if off.max(initial=0.0) > TORN:
+            found.append((float(off.max()), int(data.efc_id[off.argmax()]), chart.format(point)))
+    if not found:
         return ""
+    most, number, where = max(found)
+    name = model.equality(number).name or f"equality constraint {number}"
     return (
-        f"state() puts the robot where {worst[0]}: MuJoCo pulls it together in the first samples, and "
-        "moves it by that; let state() give the positions of all joints that belong to the chart point"
+        f"state() puts the robot where {name} is off by {most:.2g} (m or rad), as at {where}: MuJoCo pulls "
+        "it together in the first samples, and moves it by that; let state() give the positions of all "
+        "joints that belong to the chart point"
     )
 
 
@@ -324,11 +322,8 @@ def _check_parts(task: Task) -> None:
         )
     # Tables and figures give the bound as the noise of the coordinates with share 1.
     if task.source is not None and 1 not in shares[:d]:
-        most, remedy = (
-            max(shares[:d]),
-            "let the chart hold a column of the measurement on which noise acts",
-        )
-        if most:
+        remedy = "let the chart hold a column of the measurement on which noise acts"
+        if most := max(shares[:d]):
             remedy = f"divide it by {most:g}, and give an eps that is {most:g} times as large"
         raise BadInput(
             f"noisy is {task.noisy}, so that --eps is the noise of none of {listed(chart.names)}: {remedy}"
