@@ -290,7 +290,7 @@ def test_episodes_stand_in_for_the_game_where_the_policy_draws(circle, tmp_path)
     page = (tmp_path / "run" / "diagnosis.html").read_text()
     assert "which this policy is not (it draws its inputs)." in page
     assert isinstance(run.steady, MlpPolicy)
-    with pytest.raises(BadInput, match=r"it draws its inputs.*--episodes"):
+    with pytest.raises(BadInput, match=r"it draws its inputs.*the noise 'attack'"):
         noisy_arcs(run, np.zeros((1, 1)), "worst")
 
 
