@@ -48,6 +48,18 @@ def vehicle_outcome(z, action):
         assert "outcome" not in info
 
 
+def test_what_gymnasium_can_make_are_the_tasks_of_the_package_as_they_are():
+    code = (
+        "import hyrl_mj, gymnasium, sys\n"
+        "own = {n: s for n, s in gymnasium.registry.items() if n.startswith('hyrl_mj/')}\n"
+        "assert 'hyrl_mj.tasks' not in sys.modules\n"
+        "assert len(own) == len(hyrl_mj.task_names()) > 10\n"
+        "assert own == {n: gymnasium.registry[n] for n in own}, 'the tasks have registered others'\n"
+    )
+    done = python(code)
+    assert done.returncode == 0, done.stderr
+
+
 @needs_gl  # Gymnasium's checker renders
 @pytest.mark.parametrize("check", [gymnasium_check, sb3_check])
 def test_the_checkers_of_both_libraries_are_content(task, check):
