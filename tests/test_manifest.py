@@ -140,6 +140,25 @@ def test_a_file_that_a_stage_did_without_makes_it_out_of_date_once_it_is_there(f
     assert "report" not in done(folder)
 
 
+@pytest.mark.parametrize(
+    ("stage", "name", "removable"),
+    [
+        ("extended-sets", "split.npz", False),
+        ("retrain", "mode_0_part.json", False),
+        ("replay", "replay.mp4", True),
+    ],
+)
+def test_a_removed_file_is_not_taken_for_one_that_was_never_made(folder, stage, name, removable):
+    write(folder, stage, name, "content")
+    (folder / name).unlink()
+    manifest = Manifest(folder, SETTINGS)
+    if removable:
+        assert not manifest.has(folder / name)
+        return
+    with pytest.raises(BadArtifact, match=f"{name} is missing: "):
+        manifest.has(folder / name)
+
+
 def test_files_of_an_earlier_run_go_and_others_stay(folder):
     write(folder, "retrain", "mode_0.json", "x")
     for name in ("mode_7.json", "figures/mode_mine.png", "arcs/mode_7.json"):

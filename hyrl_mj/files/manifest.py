@@ -177,12 +177,16 @@ class Manifest:
         return path
 
     def has(self, path: Path) -> bool:
-        """Returns whether a file that may be left out is there and up to date.
+        """Returns whether a file that a stage may leave out was made, and is up to date.
+
+        What shows a run may be removed; without what its controller is made of it would be another one.
 
         Raises:
-            BadArtifact: it is damaged.
+            BadArtifact: it is damaged, or missing though the controller was made of it.
         """
-        if (name := self._name(path)) in self._current(self._entries()) and path.is_file():
+        name = self._name(path)
+        of_controller = any(re.fullmatch(FILES[s], name) for s in ("extended-sets", "retrain"))
+        if name in self._current(self._entries()) and (path.is_file() or of_controller):
             return self.checked(path) == path
         self._note(name, "")
         return False
