@@ -19,7 +19,7 @@ def row(setting, seed, policy, hyrl, figure="proved"):
 def test_means_differences_and_the_probability_of_improvement():
     rows = [row(CIRCLE, i, p, h) for i, (p, h) in enumerate([(0.5, 1), (0.9, 1), (1, 1)])]
     rows += [row(VEHICLE, i, 0.0, 0.9) for i in range(3)]
-    rows += [Row(VEHICLE, 3), row(VEHICLE, 4, None, 0.9)]
+    rows += [Row(VEHICLE, 3), row(VEHICLE, 4, None, None)]
     (found,) = improvements(rows)
     assert (found.figure, found.runs) == ("proved", 6)
     assert found.policy.value == pytest.approx(0.4)
@@ -32,6 +32,19 @@ def test_means_differences_and_the_probability_of_improvement():
     # On the circle one seed of three ties with all; on the vehicle HyRL is always better.
     assert found.better == pytest.approx((5 / 6 + 1) / 2)
     assert improvements(rows) == [found], "the same numbers again"
+
+
+@pytest.mark.parametrize("figure", ["proved", "not_broken", "margin"])
+def test_a_run_that_has_no_figure_of_one_controller_is_not_left_out(figure):
+    rows = [row(CIRCLE, 0, 0.1, 0.3, figure), row(CIRCLE, 1, 0.1, None, figure)]
+    (found,) = improvements(rows)
+    assert (found.runs, found.policy.value, found.hyrl.value) == (2, 0.1, 0.15)
+    shares = profile(rows, figure, np.array([0.05, 0.2]))
+    assert {who: list(share) for who, share in shares.items()} == {
+        "policy": [1, 0],
+        "hyrl": [0.5, 0.5],
+    }
+    assert improvements([row(CIRCLE, 0, None, 0.3, "late")]) == []
 
 
 def test_less_is_better_where_it_is():

@@ -32,6 +32,9 @@ SAMPLED = {
     **{f"reached_{kind}": f"episodes_{kind}" for kind in KINDS},
     "withstood_attack": "attacked",
 }
+# Figures of the game. Where only one controller has one, a replay refuted what was proved of the other, or it
+# loses some start without noise: its figure counts as 0, because leaving the run out would favour it.
+OF_GAME = ("proved", "not_broken", "margin")
 # Seeds of each setting from which an interval is computed.
 LEAST_SEEDS = 3
 
@@ -50,7 +53,7 @@ class Improvement:
 
     Attributes:
         figure: its name in `COMPARED`.
-        runs: number of runs that have it.
+        runs: number of runs that have it, see also `OF_GAME`.
         policy, hyrl: the means of both controllers, over the seeds and then over the settings.
         difference: of HyRL less the policy, in the same runs.
         better: the probability that HyRL is better than the policy in a run of the same setting with
@@ -73,10 +76,9 @@ def improvements(rows: Iterable[Row]) -> list[Improvement]:
         # Of policy and HyRL, and the number of starts that were tried, 0 where the figure is no share.
         by_setting: dict[Setting, list[tuple[float, float, float]]] = {}
         for row in done:
-            policy, hyrl = (row.figures.get(f"{who}_{figure}") for who in ("policy", "hyrl"))
-            if policy is not None and hyrl is not None:
+            if (both := _of_both(row, figure)) is not None:
                 starts = row.figures.get(SAMPLED.get(figure, "")) or 0.0
-                by_setting.setdefault(row.setting, []).append((policy, hyrl, starts))
+                by_setting.setdefault(row.setting, []).append((*both, starts))
         if not by_setting:
             continue
         groups, better = [np.array(group) for group in by_setting.values()], []
@@ -138,10 +140,16 @@ def profile(rows: Iterable[Row], figure: str, thresholds: np.ndarray) -> dict[st
         By controller the share (k,) of the runs in which its figure is at least as large; {} if no run has
         the figure.
     """
-    done = [row.figures for row in rows if row.done]
-    shares = {}
-    for who in ("policy", "hyrl"):
-        values = [value for own in done if (value := own.get(f"{who}_{figure}")) is not None]
-        if values:
-            shares[who] = np.mean(np.array(values)[:, None] >= thresholds, axis=0)
-    return shares
+    found = [both for row in rows if row.done and (both := _of_both(row, figure)) is not None]
+    if not found:
+        return {}
+    shares = np.mean(np.array(found)[:, :, None] >= thresholds, axis=0)
+    return dict(zip(("policy", "hyrl"), shares, strict=True))
+
+
+def _of_both(row: Row, figure: str) -> tuple[float, float] | None:
+    """Returns a figure of policy and HyRL in a run; None if they cannot be compared by it."""
+    policy, hyrl = (row.figures.get(f"{who}_{figure}") for who in ("policy", "hyrl"))
+    if figure in OF_GAME and (policy is None) != (hyrl is None):
+        return policy or 0.0, hyrl or 0.0
+    return None if policy is None or hyrl is None else (policy, hyrl)
