@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from planted import ChartPolicy, sign_policy
+from planted import sign_policy
 
 from hyrl_mj import Noise, Outcome, Sample
 from hyrl_mj.policies.controllers import PolicyController
@@ -54,45 +54,6 @@ def test_it_chooses_what_leads_to_the_greatest_danger_ahead(puck, loop):
         assert danger_ahead(puck, loop.policy, start, choice) == max(dangers)
         matters += max(dangers) > dangers[0]
     assert matters >= 3
-
-
-class Forgetful(adversary.Lookahead):
-    """The plain twin: simulates everything anew at every sample."""
-
-    simulated = 0
-
-    def _keep(self, *_):
-        pass
-
-    def _simulate(self, begun, past, samples):
-        Forgetful.simulated += samples * len(begun.state)
-        return super()._simulate(begun, past, samples)
-
-
-class Counting(adversary.Lookahead):
-    simulated = 0
-
-    def _simulate(self, begun, past, samples):
-        Counting.simulated += samples * len(begun.state)
-        return super()._simulate(begun, past, samples)
-
-
-def test_what_was_simulated_before_is_not_simulated_again(puck):
-    steps = np.linspace(-1, 1, 2)
-    policy = ChartPolicy(
-        puck, lambda z: steps[np.abs(steps - np.tanh(9 * z[:, 1:])).argmin(axis=1)][:, None]
-    )
-    z = np.random.default_rng(0).uniform([0.0, -0.3], [0.6, 0.3], (60, 2))
-    loop, shares = PolicyController(policy), np.array(puck.noisy, dtype=float)
-    settings = LoopSettings(record=True, quiet=True)
-    runs = [
-        closed_loop(puck, loop, z, kind(EPS, shares), settings=settings)
-        for kind in (Counting, Forgetful)
-    ]
-    np.testing.assert_array_equal(runs[0].outcome, runs[1].outcome)
-    np.testing.assert_array_equal(runs[0].u, runs[1].u)
-    np.testing.assert_allclose(runs[0].measured, runs[1].measured, rtol=0, atol=1e-9)
-    assert Counting.simulated < 0.8 * Forgetful.simulated
 
 
 def test_where_every_answer_is_the_same_there_is_no_noise(puck, loop):

@@ -6,7 +6,7 @@ noise is a class of its own, a `Signal`, that `register_noise` registers by its 
 
 from hyrl_mj.simulation.arc import LONGEST, HybridArc, samples, simulate, simulate_batch
 from hyrl_mj.simulation.checked_noise import begin_signal, drawn
-from hyrl_mj.simulation.lookahead import Ahead, Lookahead
+from hyrl_mj.simulation.lookahead import Lookahead
 from hyrl_mj.simulation.noise import (
     KINDS,
     NOT_STARTED,
@@ -38,7 +38,6 @@ __all__ = [
     "NOT_STARTED",
     "OF_RUNS",
     "SENSOR",
-    "Ahead",
     "AnyNoise",
     "AttackSettings",
     "HybridArc",

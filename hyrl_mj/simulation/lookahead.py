@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import product
 from typing import Self
 
@@ -12,30 +11,12 @@ from hyrl_mj.errors import BadInput
 from hyrl_mj.physics.plant import Plant
 from hyrl_mj.policies import Controller, answer, is_memory, memory_at_start
 from hyrl_mj.simulation.noise import NOT_STARTED, Sample, Signal, register_noise
-from hyrl_mj.simulation.passing import Rows
 from hyrl_mj.tasks import Outcome, Task, check_finite
 
 # Samples by which a plant with inertia is simulated ahead.
 AHEAD = 6
 # Simulations side by side.
 BATCH = 2_048
-
-
-@dataclass
-class Ahead(Rows):
-    """What k simulations ahead show, and how they could go on.
-
-    Attributes:
-        danger: (k, samples) the danger after each sample; -inf after the end of a simulation.
-        state: (k, nstate) MuJoCo's whole state after the last sample.
-        answers: (k, m + 1) the controller's inputs and mode in that state.
-        goes_on: (k,) bool, whether the simulation has not ended.
-    """
-
-    danger: np.ndarray
-    state: np.ndarray
-    answers: np.ndarray
-    goes_on: np.ndarray
 
 
 def memory_of(controller: Controller, now: Sample) -> np.ndarray:
@@ -102,9 +83,6 @@ class Lookahead(Signal):
     Candidates on each noisy column are both ends of the bound, their halves and zero; with more than two
     such columns, or two and inertia, the ends and zero.
 
-    What was simulated for the noise that was chosen is at the next sample the simulation without noise, but
-    for its last sample.
-
     Attributes:
         samples: number of samples by which the closed loop is simulated ahead.
     """
@@ -116,7 +94,6 @@ class Lookahead(Signal):
     controller: Controller
     samples: int
     _candidates: np.ndarray
-    _kept: Ahead
     _copies: Plant | None = None
 
     def against(self, task: Task, controller: Controller | None) -> Self:
@@ -150,16 +127,12 @@ class Lookahead(Signal):
         directions[alone[0], rest], directions[alone[1], rest] = -1.0, 1.0
         return directions
 
-    def reset(self, n: int, rng: np.random.Generator) -> None:
-        super().reset(n, rng)
-        self._kept_at = np.full(n, -2)  # the sample at which something was kept of each run
-
     def sample(self, now: Sample) -> np.ndarray:
         """Returns the most dangerous noise; among equals zero comes first, then the largest noise."""
         true, chosen = now.measurement, np.zeros_like(now.measurement)
         unstable = now.plant.unstable[now.rows]
         running = np.flatnonzero(self.task.outcome(true, unstable) == Outcome.RUNNING)
-        q, rows, k = now.q[running], now.rows[running], now.k[running]
+        q, rows = now.q[running], now.rows[running]
         memory = memory_of(self.controller, now)[running]
         asked = true[running], self._candidates, q, memory
         u, q, memory = each_answer(self.task, self.controller, *asked)
@@ -172,88 +145,40 @@ class Lookahead(Signal):
             for i in range(len(answers))
         ]
         candidate, at = np.nonzero(differs & ~np.stack(repeated))
-        after = answers[candidate, at], memory[candidate, at]
-        runs = self._ahead(now.plant, rows[at], k[at], candidate, *after)
-        danger = np.full(answers.shape[:2], -np.inf)
-        danger[candidate, at] = runs.danger.max(axis=1)
-        best = danger.argmax(axis=0)
-        chosen[running] = self._candidates[best]
-        if self.samples > 1 and not remembers:
-            self._keep(now.plant.n, rows[at], k[at], runs, candidate == best[at])
+        state, danger = now.plant.state[rows[at]], np.full(answers.shape[:2], -np.inf)
+        given, after = answers[candidate, at], memory[candidate, at]
+        for first in range(0, len(at), BATCH):
+            some = slice(first, first + BATCH)
+            danger[candidate[some], at[some]] = self._ahead(state[some], given[some], after[some])
+        chosen[running] = self._candidates[danger.argmax(axis=0)]
         return chosen
 
-    def _ahead(
-        self,
-        plant: Plant,
-        rows: np.ndarray,
-        k: np.ndarray,
-        candidate: np.ndarray,
-        answers: np.ndarray,
-        memory: np.ndarray,
-    ) -> Ahead:
-        """Returns the simulations of candidates (c,) from the states of a plant's `rows` (c,).
+    def _ahead(self, state: np.ndarray, answers: np.ndarray, memory: np.ndarray) -> np.ndarray:
+        """Returns the greatest danger (k,) that simulations from whole states (k, nstate) of MuJoCo meet.
 
         Args:
-            plant, rows: as above.
-            k: (c,) the number of the sample.
-            candidate: (c,) indices of the candidates.
-            answers: (c, m + 1) the controller's answers to them, inputs and mode.
-            memory: (c, ...) its memory after these answers.
+            state: as above.
+            answers: (k, m + 1) the controller's inputs and mode in these states.
+            memory: (k, ...) its memory after these answers.
         """
-        state = plant.state[rows]
-        danger = np.full((len(rows), self.samples), -np.inf)
-        runs = Ahead(danger, state, answers, np.ones(len(rows), dtype=bool))
-        known = (candidate == 0) & (self._kept_at[rows] == k - 1)
-        if known.any():
-            kept = self._kept[rows[known]]
-            kept.danger = np.hstack([kept.danger[:, 1:], np.full((len(kept.danger), 1), -np.inf)])
-            runs.put(np.flatnonzero(known), kept)
-        for some, samples in ((~known, self.samples), (known & runs.goes_on, 1)):
-            numbers = np.flatnonzero(some)
-            for first in range(0, len(numbers), BATCH):
-                batch = numbers[first : first + BATCH]
-                later = self._simulate(runs[batch], memory[batch], samples)
-                later.danger = np.hstack([runs.danger[batch, :-samples], later.danger])
-                runs.put(batch, later)
-        return runs
-
-    def _keep(
-        self, n: int, rows: np.ndarray, k: np.ndarray, runs: Ahead, chosen: np.ndarray
-    ) -> None:
-        """Keeps the `chosen` (c,) bool of simulations (c,), for `rows` (c,) of n runs at samples k (c,)."""
-        if (self._kept_at < 0).all():
-            self._kept = Ahead(
-                *(np.zeros((n, *values.shape[1:]), values.dtype) for values in vars(runs).values())
-            )
-        self._kept_at[rows[chosen]] = k[chosen]
-        self._kept.put(rows[chosen], runs[chosen])
-
-    def _simulate(self, begun: Ahead, memory: np.ndarray, samples: int) -> Ahead:
-        """Simulates from the states of `begun` (k,), with its answers first, over so many samples.
-
-        `memory` (k, ...) is that after these answers.
-        """
-        plant = self._placed(begun.state)
-        answers, rows = begun.answers, np.arange(len(begun.answers))
-        danger, next_answers = np.full((len(rows), samples), -np.inf), begun.answers.copy()
-        for sample in range(samples):
+        plant, rows = self._placed(state), np.arange(len(state))
+        worst = np.full(len(state), -np.inf)
+        for _ in range(self.samples):
             u, q = answers[:, :-1], answers[:, -1].astype(int)
             plant.step(u, rows)
             after = plant.measurement[rows]
             outcome = self.task.outcome(after, plant.unstable[rows])
             goes_on = outcome == Outcome.RUNNING
             failed = ~goes_on & (outcome != Outcome.REACHED)
-            danger[rows, sample] = np.where(failed, np.inf, self.task.danger(after))
-            check_finite(self.task, "danger", danger[rows, sample], after, infinite=True)
+            danger = np.where(failed, np.inf, self.task.danger(after))
+            check_finite(self.task, "danger", danger, after, infinite=True)
+            worst[rows] = np.maximum(worst[rows], danger)
             rows = rows[goes_on]
             if not len(rows):
                 break
-            before = after[goes_on], q[goes_on], memory[goes_on]
-            u, q, memory = answer_of(self.controller, *before)
+            u, q, memory = answer_of(self.controller, after[goes_on], q[goes_on], memory[goes_on])
             answers = np.column_stack([u, q])
-        next_answers[rows] = answers[: len(rows)]
-        end = plant.state[: len(danger)]
-        return Ahead(danger, end, next_answers, np.isin(np.arange(len(danger)), rows))
+        return worst
 
     def _placed(self, state: np.ndarray) -> Plant:
         """Returns copies of the robot, the first k of them in whole states (k, nstate) of MuJoCo."""

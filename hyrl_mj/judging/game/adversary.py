@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -18,7 +17,7 @@ from hyrl_mj.judging.game.solver import (
     noisy_moves,
     solve,
 )
-from hyrl_mj.simulation import NOT_STARTED, Ahead, Lookahead, Sample, Signal
+from hyrl_mj.simulation import NOT_STARTED, Lookahead, Sample, Signal
 from hyrl_mj.tasks import Outcome
 
 
@@ -108,10 +107,9 @@ class WorstEstimate(Lookahead):
         ):  # beside a wall, what lies inside of it is not worse
             self._worth = self._worth[:, nearest_of(lattice.grid, lattice.running)]
 
-    def _simulate(self, begun: Ahead, memory: np.ndarray, samples: int) -> Ahead:
+    def _ahead(self, state: np.ndarray, answers: np.ndarray, memory: np.ndarray) -> np.ndarray:
         task, grid = self._lattice.task, self._lattice.grid
-        answers, rows = begun.answers, np.arange(len(begun.answers))
-        plant = self._placed(begun.state)
+        plant, rows = self._placed(state), np.arange(len(state))
         plant.step(answers[:, :-1], rows)
         measured = plant.measurement[rows]
         lost = task.failed(measured) | ~grid.chart.contains(task.z(measured))
@@ -119,5 +117,4 @@ class WorstEstimate(Lookahead):
         for mode, values in zip(self._modes, self._worth, strict=False):
             at = (answers[:, -1] == mode) & ~lost
             worth[at] = grid.interpolate(values, task.z(measured[at]))
-        worth = np.where(task.ending(measured) == Outcome.REACHED, 0.0, worth)
-        return replace(begun, danger=worth[:, None])
+        return np.where(task.ending(measured) == Outcome.REACHED, 0.0, worth)
