@@ -229,14 +229,6 @@ def test_a_zip_of_sb3_1_with_shared_layers_acts_as_it_did(vehicle, tmp_path):
     assert_it_acts_alike(policy, model, vehicle, observations(vehicle))
 
 
-def test_an_agent_comes_back_from_disk(circle, tmp_path):
-    policy = load_agent(saved(untrained(SAC, circle, net_arch=[8]), tmp_path), circle)
-    policy.save(tmp_path / "p.safetensors")
-    back = MlpPolicy.load(tmp_path / "p.safetensors")
-    observation = observations(circle, 50)
-    np.testing.assert_array_equal(back.inputs(observation), policy.inputs(observation))
-
-
 def test_training_goes_on_from_an_agent_of_the_same_networks_only(circle, tmp_path):
     settings = preset(circle, "smoke").stage1
     agent = load_agent(saved(untrained(A2C, circle, activation_fn=nn.SiLU), tmp_path), circle)

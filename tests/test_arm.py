@@ -108,12 +108,6 @@ def test_runs_with_nothing_left_to_decide_have_no_way(arm):
     assert arm.direction(moved(arm, folding(arm), z).path).tolist() == [-1, -1]
 
 
-def test_its_mirror_image_turns_the_mirrored_way(arm):
-    z = arm.starts(50, np.random.default_rng(0))
-    np.testing.assert_allclose(arm.clearance(z), arm.clearance(-z), atol=1e-9)
-    assert (arm.ending(z) == arm.ending(-z)).all()
-
-
 def test_in_the_training_of_a_mode_a_crash_costs_as_much_as_leaving(arm):
     z = np.array([[0.44, 0.0], [2.0, 0.0], [np.pi, np.pi - 0.4]])
     domain = Domain(lambda n, rng: z, lambda z: z[:, 0] < 2.05, exit_reward=-10.0)

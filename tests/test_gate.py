@@ -67,14 +67,6 @@ def test_the_pillar_in_the_picture_is_where_its_phase_says(gate):
     assert high - low > 0.5
 
 
-def test_its_phase_goes_on_beyond_a_period(gate):
-    runs = moved(gate, Constant(0.0), [[0.0, 1.2, 3.0], [0.0, 1.2, -3.0]])
-    k = np.arange(len(runs.path))[:, None]
-    expected = np.array([3.0, -3.0]) + gate.speeds[2] * gate.dt * k
-    np.testing.assert_allclose(runs.path[..., 2], expected, atol=1e-5)
-    assert runs.path[-1, 0, 2] > np.pi + 3
-
-
 @pytest.mark.parametrize("phase", [-2.0, 0.3, 1.5])
 def test_what_touches_the_pillar_has_crashed(gate, phase):
     radius = mjcf.geom_size(gate.model, "obstacle")[0]

@@ -5,30 +5,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from planted import random_states
 
 import hyrl_mj
-from hyrl_mj import BadInput, Learning, Outcome, Scene
+from hyrl_mj import BadInput, Outcome, Scene
 from hyrl_mj.gym_export import BatchedEnv
-from hyrl_mj.learning import preset
 from hyrl_mj.tasks.unit_circle import UnitCircle
 
 PI = np.pi
 
 
 # ---- every task
-
-
-def test_its_mirror_image_earns_the_same_reward(task):
-    rng = np.random.default_rng(0)
-    z = random_states(task, 500, rng)
-    image = z * [1, -1] if task.name == "vehicle" else -z
-    u = rng.uniform(*task.input_limits, (500, len(task.inputs)))
-    reward, mirrored = task.reward(z, u), task.reward(image, u * task.mirror.inputs)
-    np.testing.assert_allclose(mirrored, reward, atol=1e-12)
-    np.testing.assert_array_equal(task.ending(image), task.ending(z))
-    signs = np.array(task.mirror.observation)
-    np.testing.assert_allclose(task.observation(image), task.observation(z) * signs, atol=1e-12)
 
 
 def test_a_task_can_be_noisy_on_all_coordinates(vehicle, puck):
@@ -43,18 +29,6 @@ def test_a_task_can_be_noisy_on_all_coordinates(vehicle, puck):
             )
         assert task.noisy == before != everywhere.noisy
         assert pickle.loads(pickle.dumps(task)).noisy == before
-
-
-def test_bad_measurements_are_refused(task):
-    p = task.measurement_columns
-    with pytest.raises(BadInput, match=rf"\(n, {p}\)"):
-        task.check_measurement(np.zeros((2, p + 1)))
-    with pytest.raises(BadInput, match=rf"\(n, {p}\)"):
-        task.check_measurement(np.zeros(p))
-    measured = np.zeros((2, p))
-    measured[1, 0] = np.nan
-    with pytest.raises(BadInput, match=r"measurement\[1, 0\] is nan"):
-        task.check_measurement(measured)
 
 
 def test_an_unknown_task_lists_the_known():
@@ -76,19 +50,6 @@ def test_a_scene_fills_in_what_is_left_out():
     assert (scene.camera, scene.tracked) == ("overhead", "tracked")
     assert [scene.mode_name(q) for q in (0, 1, 2, -1)] == ["0 (up)", "1 (down)", "2", "-1"]
     assert replace(scene, policy_starts=((0.5,),)).policy_starts == ((0.5,),)
-
-
-def test_the_default_algorithm_depends_on_the_levels():
-    assert [Learning().algorithm, Learning(levels=5).algorithm] == ["ppo", "ppo"]
-    assert Learning("a2c", levels=5).algorithm == "a2c"
-    assert (Learning().search, Learning().horizon) == ("outcome", 0.5)
-
-
-def test_a_preset_trains_with_the_algorithm_that_is_asked_for(vehicle):
-    before = vehicle.learning
-    assert preset(vehicle).stage1.algorithm == "dqn"
-    assert preset(vehicle, algorithm="ppo").stage1.algorithm == "ppo"
-    assert vehicle.learning is before
 
 
 # ---- a reward that sees the input
@@ -137,12 +98,6 @@ def test_circle_observation_is_the_point_on_the_circle(circle):
     expected = [[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]]
     observation = circle.observation(np.array([[0.0], [PI / 2], [3 * PI]]))
     np.testing.assert_allclose(observation, expected, atol=1e-12)
-
-
-def test_circle_takes_any_winding(circle):
-    np.testing.assert_array_equal(circle.chart.check([7 * PI], circle.name), [[7 * PI]])
-    wrapped = circle.chart.wrap(np.array([[-PI / 2], [9 * PI]]))
-    np.testing.assert_allclose(wrapped, [[1.5 * PI], [PI]])
 
 
 def test_circle_verdict(circle):
@@ -213,6 +168,14 @@ def test_vehicle_direction(vehicle):
     start = [[0.0, 0.1], [0.0, 0.1], [0.0, 0.0], [2.0, 1.0]]
     end = [[1.5, 0.9], [1.6, -0.9], [0.7, -0.1], [2.1, 1.0]]
     np.testing.assert_array_equal(vehicle.direction(np.array([start, end])), [0, 1, 1, -1])
+
+
+@pytest.mark.parametrize(
+    "z", [np.zeros((2, 9)), np.zeros((2, 2, 2)), [], "here", [[0.0], [0.0, 1.0]], [[0.0, np.nan]]]
+)
+def test_what_is_no_state_of_a_task_is_refused_by_its_name(vehicle, z):
+    with pytest.raises(BadInput, match="vehicle"):
+        vehicle.chart.check(z, vehicle.name)
 
 
 @pytest.mark.parametrize("z", [(-0.1, 0.0), (3.1, 0.0), (0.0, 1.6), (1.0, -9.0)])
