@@ -50,8 +50,6 @@ _TD3 = replace(
         "tau": 0.02,
     },
 )
-_DDPG = replace(_TD3, algorithm="ddpg")
-_SAC = replace(_TD3, algorithm="sac", action_noise=0.0, options={**_TD3.options, "ent_coef": 0.02})
 # What learns a scene that nobody has tuned it for: a wide network whose first layer sees all of the chart,
 # and episodes all over it.
 _WIDE: dict[str, Any] = {
@@ -61,14 +59,14 @@ _WIDE: dict[str, Any] = {
     "normalize": True,
     "rehearse": REHEARSED,
 }
-# A mirror symmetry doubles the width, see `Training.symmetric`, and halves what there is to learn.
-_WITHOUT_MIRROR: dict[str, Any] = {"hidden": (192, 192)}
 _CONTINUOUS = {
     "ppo": replace(_SMALL, **_WIDE),
     "a2c": _A2C,
-    "sac": _SAC,
+    "sac": replace(
+        _TD3, algorithm="sac", action_noise=0.0, options={**_TD3.options, "ent_coef": 0.02}
+    ),
     "td3": _TD3,
-    "ddpg": _DDPG,
+    "ddpg": replace(_TD3, algorithm="ddpg"),
 }
 _SMALL_LEVELS = replace(
     _SMALL,
@@ -141,11 +139,6 @@ _SMOKE_MODES = 8_192
 # the sets; fewer for plants with dynamics, whose samples are slower to simulate.
 _GRIDS = {1: (120, 2880), 2: (120, 240), 3: (24, 48), 4: (11, 13)}
 _GRIDS_DYNAMIC = {1: (120, 720), 2: (40, 96), 3: (16, 30), 4: (8, 11)}
-# Where runs from many nodes take too long: length of the last rods, as a share of the first.
-_RESOLUTION_COARSE = 1 / 8
-# In three dimensions these have as many more cells for the sets as the noise needs, up to so many; most of
-# their nodes are not simulated.
-_MOST_CELLS = 88
 # Cells of the worst-case game's lattice in a smoke run.
 _LATTICE_SMOKE = {1: 1_200, 2: 120, 3: 60}
 
@@ -185,10 +178,11 @@ def preset(
     if task.kinematic and dimension == 2:
         cells = aligned_cells(task, cells)
     if not task.kinematic and dimension == 3 and name != "smoke":
-        cells = enough_cells(task.chart, task.noise_in_chart(eps), cells, _MOST_CELLS)
+        # As many more as the noise needs; most of their nodes are not simulated.
+        cells = enough_cells(task.chart, task.noise_in_chart(eps), cells, most=88)
     if (most := task.learning.cells) is not None:
         rods, cells = min(rods, most), min(cells, most)
-        resolution = _RESOLUTION_COARSE
+        resolution = 1 / 8  # runs from many nodes take too long
     settings = Settings(
         task=reference(task),
         preset=name,
@@ -225,7 +219,8 @@ def _stage1(task: Task, name: str, algorithm: str) -> Training:
         training = replace(training, attempts=3)
     if name != "paper":
         if known == "ppo" and task.mirror is None:
-            training = replace(training, **_WITHOUT_MIRROR)
+            # A mirror doubles the width, see `Training.symmetric`, and halves what there is to learn.
+            training = replace(training, hidden=(192, 192))
         if algorithm == task.learning.algorithm:
             training = _with(training, task, "training")
     if name == "smoke":

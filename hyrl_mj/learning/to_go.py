@@ -11,11 +11,6 @@ from hyrl_mj.gym_export import Pay
 from hyrl_mj.sets import GridSet, covering, shortest_ways
 from hyrl_mj.tasks import Outcome, Task, largest_moves
 
-# About so many nodes of a chart are asked whether an episode goes on there.
-NODES = 2**16
-# Starts from which a way has to lead to the goal.
-STARTS = 1_000
-
 
 class NoWay(HyrlError):
     """No way leads from the starts of a task to its goal."""
@@ -47,7 +42,8 @@ class WayToGo:
         inside: Callable[[np.ndarray], np.ndarray] | None = None,
     ):
         chart = task.chart
-        nodes = covering(chart, round(NODES ** (1 / np.clip(chart.dimension, 2, 4))))
+        # About 2 ** 16 nodes are asked whether an episode goes on there.
+        nodes = covering(chart, round(2 ** (16 / np.clip(chart.dimension, 2, 4))))
         z = nodes.nodes
         plant = task.placed(z)
         measurement = plant.measurement
@@ -67,7 +63,7 @@ class WayToGo:
         pairs, ends = nodes.neighbours(), np.flatnonzero(goal)
         ways = shortest_ways(chart, z, pairs, free, ends, weight=weight)
         leads = np.isfinite(ways)
-        starts = task.starts(STARTS, np.random.default_rng(0))
+        starts = task.starts(1_000, np.random.default_rng(0))
         if not leads[nodes.nearest(starts)].any():
             what = "leads from its starts to its goal" if goal.any() else "has a goal to lead to"
             raise NoWay(

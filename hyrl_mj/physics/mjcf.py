@@ -68,7 +68,6 @@ def load(path: Path) -> mujoco.MjModel:
 # MuJoCo's own compilers, and the latest models of `compiled_once` by their MJCF, which nobody else has.
 _OWN = {name: getattr(mujoco.MjModel, name) for name in ("from_xml_path", "from_xml_string")}
 _LATEST: dict[str, mujoco.MjModel] = {}
-MOST_LATEST = 8
 
 
 @contextmanager
@@ -108,7 +107,7 @@ def _copied(xml: str, compiled: Callable[[], mujoco.MjModel]) -> mujoco.MjModel:
     """Returns a copy of the model of an MJCF, which is compiled unless it is among the latest."""
     if (model := _LATEST.get(xml)) is None:
         model = compiled()
-        if len(_LATEST) >= MOST_LATEST:
+        if len(_LATEST) >= 8:  # each may take megabytes
             _LATEST.clear()
         _LATEST[xml] = model
     return copy.copy(model)

@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 # The trial of an agent: runs side by side, half of them by random inputs; and their samples. Of what takes a
 # call a batch, every fourth one does.
 RUNS, SAMPLES, SOME = 16, 64, 4
-LONGEST = 10.0  # for how long a forked process is waited for, which may hang [s]
 # Sums of 256 numbers in another order differ by some 16 roundings of float32; a network has a few of them.
 ROUNDING = 32 * float(np.finfo(np.float32).eps)
 
@@ -128,7 +127,7 @@ def _forked(work: Callable[[Any], str]) -> Iterator[Callable[[Any], str]]:
     def told(given: Any) -> str:
         with suppress(EOFError, OSError):
             ours.send(given)
-            return str(ours.recv()) if ours.poll(LONGEST) else ""
+            return str(ours.recv()) if ours.poll(10.0) else ""  # [s], since it may hang
         return ""
 
     try:

@@ -19,10 +19,6 @@ from hyrl_mj.policies.pickled import Call
 
 # Limit on the file, and on the tensors as float32 [bytes]: the largest MLP policies take a few megabytes.
 LARGEST = 2**25
-_TYPES = {
-    "Float": "f4", "Double": "f8", "Half": "f2", "BFloat16": "u2", "Long": "i8", "Int": "i4", "Short": "i2",
-    "Char": "i1", "Byte": "u1", "Bool": "?",
-}  # fmt: skip
 NO_TENSORS = (
     "its policy.pth is damaged or holds more than tensors, which an agent's never does (or torch before 1.6 "
     "saved it): nothing in it was executed; get the file again, or save it again with a newer torch"
@@ -73,9 +69,13 @@ def _tensors(file: ZipFile) -> dict[str, np.ndarray]:
 
 def _tensor(tensor: Call, storage: bytes, kind: str, order: Any) -> np.ndarray:
     """Returns a tensor in a storage, whose numbers are of a kind such as "torch.FloatStorage"."""
+    types = {
+        "Float": "f4", "Double": "f8", "Half": "f2", "BFloat16": "u2", "Long": "i8", "Int": "i4",
+        "Short": "i2", "Char": "i1", "Byte": "u1", "Bool": "?",
+    }  # fmt: skip
     _, offset, size, stride, *_ = tensor.arguments
     name = kind.removeprefix("torch.").removesuffix("Storage")
-    numbers = np.frombuffer(storage, np.dtype(_TYPES[name]).newbyteorder(order))
+    numbers = np.frombuffer(storage, np.dtype(types[name]).newbyteorder(order))
     last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
     if math.prod(size) and last >= len(numbers):
         raise ValueError("a tensor is larger than its storage")

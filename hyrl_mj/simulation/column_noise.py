@@ -14,14 +14,6 @@ LEAST = 50  # samples: fewer do not tell noise from motion
 # With which a test finds what is not there: once in 10,000 columns.
 CHANCE = 1e-4
 ENDS = 0.002, 0.998  # quantiles between which drift is taken: beyond them is mostly noise
-MOST_LAGS = 40  # of the autocorrelation [samples]
-# Ratios of a measurement to its reference that are a mistake about units.
-UNITS = {
-    f"{a} against {b}": factor
-    for a, b, x in (("mm", "m", 1000), ("cm", "m", 100), ("degrees", "radians", 180 / np.pi))
-    for a, b, factor in ((a, b, x), (b, a, 1 / x))
-}
-
 ANYWHERE = 1 / np.sqrt(12)  # the standard deviation of an angle that may be any [turns]
 
 
@@ -273,10 +265,10 @@ def _correlated(
     ]
 
 
-def _autocorrelation(left: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Returns the autocorrelation, from lag 0 on, of the values (n,) that are used (n,)."""
+def _autocorrelation(left: np.ndarray, used: np.ndarray, most: int = 40) -> np.ndarray:
+    """Returns the autocorrelation, for lags from 0 to `most`, of the values (n,) that are used (n,)."""
     white, n = np.where(used, left - left[used].mean(), 0.0), len(left)
-    lags = range(min(MOST_LAGS + 1, n))
+    lags = range(min(most + 1, n))
     sums = np.array([white[lag:] @ white[: n - lag] for lag in lags])
     counts = np.array([np.count_nonzero(used[lag:] & used[: n - lag]) for lag in lags])
     # Of a few pairs nothing can be told.
@@ -291,12 +283,14 @@ def _check_units(name: str, y: np.ndarray, r: np.ndarray) -> None:
     both = np.isfinite(y) & np.isfinite(r)
     moves = stats.iqr(r[both]) if both.any() else 0.0
     ratio = stats.iqr(y[both]) / moves if moves else 1.0
-    for units, factor in UNITS.items():
-        if abs(ratio / factor - 1) < 0.05:
-            raise BadInput(
-                f"{name} changes {ratio:.4g} times as much as {name}_ref, as {units}: give --scale "
-                f"{name}={1 / factor:.6g}"
-            )
+    of_units = ("mm", "m", 1000), ("cm", "m", 100), ("degrees", "radians", 180 / np.pi)
+    for a, b, x in of_units:
+        for one, other, factor in ((a, b, x), (b, a, 1 / x)):
+            if abs(ratio / factor - 1) < 0.05:
+                raise BadInput(
+                    f"{name} changes {ratio:.4g} times as much as {name}_ref, as {one} against {other}: give "
+                    f"--scale {name}={1 / factor:.6g}"
+                )
 
 
 def _check_turns(name: str, error: np.ndarray) -> None:

@@ -39,9 +39,8 @@ KINDS = ("none", "uniform", "alternating", "adversarial")
 SENSOR = "sensor"
 # The words of parts of sensors that are not noise which is added to a sample; and of the errors of a log.
 DELAY, HOLD, QUANTUM, LOG = "delay", "hold", "quantum", "log"
-# Words that are no kind where noise is named: these, and noise that is searched for against a controller.
+# Noise that is searched for against a controller.
 OF_RUNS = ("attack", "worst")
-RESERVED = (DELAY, HOLD, QUANTUM, LOG, *OF_RUNS)
 # What follows the last sample of a recorded signal.
 After = Literal["refuse", "hold", "repeat", "none"]
 
@@ -139,7 +138,7 @@ def register_noise(signal: type[AnySignal]) -> type[AnySignal]:
             f"{signal.__name__} cannot be registered as {signal.kind!r}: give it a kind of one word, as "
             'kind = "walk"'
         )
-    if signal.kind in RESERVED:
+    if signal.kind in (DELAY, HOLD, QUANTUM, LOG, *OF_RUNS):
         raise BadInput(
             f"{signal.__name__} cannot be registered: {signal.kind!r} means something else where noise is "
             "named, so choose another kind"

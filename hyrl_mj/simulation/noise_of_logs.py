@@ -22,10 +22,6 @@ if TYPE_CHECKING:
     from hyrl_mj.tasks import Task
 
 TIMES = ("t", "time")
-COLUMNS = 200  # that are looked at, each of which takes some 20 ms
-SLOW = 0.5  # [s]: few robots are controlled so slowly
-LONGEST = 10  # samples of a robot, for which a row of a log may last
-MOST = 1_200_000  # samples with gaps between them, of which a column takes 150 bytes each
 
 
 @dataclass(frozen=True)
@@ -120,7 +116,7 @@ class _Windows(Signal):
         steps = np.diff(times)
         steps = np.minimum(steps, 2 * np.quantile(steps, 0.95))
         self._times = np.concatenate([[0.0], np.cumsum(steps)])
-        if (step := float(np.median(steps))) > LONGEST * task.dt:
+        if (step := float(np.median(steps))) > 10 * task.dt:  # so many samples a row may last
             raise BadInput(
                 f"the rows of the log are {step:g} s apart and the samples of {task.name} {task.dt:g} s, so "
                 "that each error would stay for long: give the times in seconds, or a log with more rows"
@@ -194,11 +190,12 @@ def noise_from_log(
                 "at rest: choose the columns that are measured, as --columns x"
             )
     times, place, step, remarks = _clock(path, data[clock[0]] if clock else None, rows, dt)
-    if place[-1] > MOST:
+    most = 1_200_000  # samples with gaps between them, of which a column takes 150 bytes each
+    if place[-1] > most:
         raise BadInput(
-            f"{path} has so many gaps in time that it takes {place[-1]:,} samples: give at most {MOST:,}"
+            f"{path} has so many gaps in time that it takes {place[-1]:,} samples: give at most {most:,}"
         )
-    if step >= SLOW:
+    if step >= 0.5:  # few robots are controlled so slowly [s]
         remarks.append(f"its rows are {step:g} s apart: are the times in seconds?")
     if rows * (1 - share) < 1 and share < 1:
         remarks.append(
@@ -244,8 +241,9 @@ def _chosen(
             raise unknown(f"measured column of {path}", name, measured)
     usual = [name for name in measured if at_rest or f"{name}_ref" in header]
     chosen = list(dict.fromkeys(columns or usual))
-    if len(chosen) > COLUMNS:
-        raise BadInput(f"{path} has {len(chosen):,} measured columns: choose at most {COLUMNS}")
+    most = 200  # each takes some 20 ms
+    if len(chosen) > most:
+        raise BadInput(f"{path} has {len(chosen):,} measured columns: choose at most {most}")
     lacks = [name for name in chosen or measured if f"{name}_ref" not in header]
     if not measured or (lacks and not at_rest):
         name = lacks[0] if lacks else "x"

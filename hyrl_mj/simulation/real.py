@@ -22,15 +22,6 @@ from hyrl_mj.tasks import Outcome, Task
 ROUNDING = 1e-8
 # The longest duration of episodes that are tried [samples].
 SAMPLES = 40
-# MuJoCo's warnings about states that it resets.
-BAD = [
-    int(kind)
-    for kind in (
-        mujoco.mjtWarning.mjWARN_BADQPOS,
-        mujoco.mjtWarning.mjWARN_BADQVEL,
-        mujoco.mjtWarning.mjWARN_BADQACC,
-    )
-]
 
 
 def judge(
@@ -210,7 +201,9 @@ def _sensed(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
 def _is_bad(data: mujoco.MjData) -> bool:
     """Returns whether MuJoCo calls the state bad, or has reset one because it was."""
     good = all((np.abs(values) <= mujoco.mjMAXVAL).all() for values in (data.qpos, data.qvel))
-    return bool(not good or data.warning.number[BAD].any())
+    kinds = mujoco.mjtWarning
+    resets = kinds.mjWARN_BADQPOS, kinds.mjWARN_BADQVEL, kinds.mjWARN_BADQACC
+    return not good or any(data.warning[int(kind)].number for kind in resets)
 
 
 def _seen(task: Task, run: Rollout, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

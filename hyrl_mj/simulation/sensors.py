@@ -39,7 +39,6 @@ if TYPE_CHECKING:
 
 # Bounds are rounded up to parts of so many, but for the rounding of sums of floats, which is far below that.
 DECIMALS, ROUNDING = 1e9, 1e-3
-MOST = 20  # parts of a sensor: each takes its time at every sample
 
 
 @register_noise
@@ -259,8 +258,8 @@ class Sensor:
                 f"the sensor {text!r:.60} is no text: give one as 'uniform 0.05 + delay 1'"
             )
         parts = re.split(r"\+(?!\d)", text)  # not that of 1e+3
-        if len(parts) > MOST:
-            raise BadInput(f"the sensor {text!r:.60} has {len(parts):,} parts: give at most {MOST}")
+        if len(parts) > 20:  # each takes its time at every sample
+            raise BadInput(f"the sensor {text!r:.60} has {len(parts):,} parts: give at most 20")
         return Sensor(tuple(map(Part.parse, parts)))
 
     def __post_init__(self) -> None:

@@ -12,9 +12,6 @@ from hyrl_mj.simulation.passing import Passing, Rows, windings
 from hyrl_mj.simulation.rollout import LoopSettings, Rollout, closed_loop
 from hyrl_mj.tasks import ANY, Outcome, Task
 
-# If a smaller share of the runs arrives, the policy has hardly learned, and all runs show ways.
-ARRIVING = 0.1
-
 
 @dataclass(frozen=True)
 class WayRuns(Rows):
@@ -42,11 +39,14 @@ class WayRuns(Rows):
 
     @property
     def arriving(self) -> bool:
-        """Whether enough runs arrive to show the ways: `ARRIVING` of those that have something to decide."""
+        """Whether a tenth of the runs arrives that have something to decide.
+
+        Otherwise the policy has hardly learned, and all runs show ways.
+        """
         counted = self.alive & self.stable
         if self.direction is not None:
             counted = counted & (self.direction != ANY)
-        return bool(counted.any() and self.arrived[counted].mean() >= ARRIVING)
+        return bool(counted.any() and self.arrived[counted].mean() >= 0.1)
 
     @property
     def usable(self) -> np.ndarray:

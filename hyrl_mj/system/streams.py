@@ -31,10 +31,6 @@ _BREAKS = re.compile("([\\n\\r\\t])")
 _SEQUENCES = re.compile("([\\n\\r\\t]|\\x1b\\[(?:[0-9;]*[mABCDGK]|\\?25[hl]))")
 
 
-# Errors of the system that a path brings about which somebody gives.
-_NAMES = (errno.ENAMETOOLONG, errno.EACCES, errno.EPERM, errno.ELOOP, errno.ENOTDIR, errno.EISDIR)
-
-
 class _Raw(io.FileIO):
     """A stream that swallows everything after the first write that fails, whose error it keeps."""
 
@@ -217,7 +213,9 @@ def _of_system(error: Exception) -> HyrlError | None:
     if not isinstance(error, OSError):
         return None
     where = "" if error.filename is None else f": {os.fsdecode(error.filename)}"
-    kind = BadInput if error.errno in _NAMES else HyrlError
+    # Those that a path brings about which somebody gives.
+    of_paths = "ENAMETOOLONG", "EACCES", "EPERM", "ELOOP", "ENOTDIR", "EISDIR"
+    kind = BadInput if error.errno in (getattr(errno, name) for name in of_paths) else HyrlError
     return kind(f"{error.strerror or brief(error)}{where}")
 
 

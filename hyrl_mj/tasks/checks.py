@@ -23,10 +23,6 @@ from hyrl_mj.tasks.obstacles import SIDES
 
 # Number of starts that are tried, and of places at which robot and obstacles may overlap.
 STARTS, OVERLAPS = 64, 512
-NEARER = (0.1, 0.01, 0.001)
-TORN = 0.01  # by how much a constraint may be off where a state begins [m, rad]: soft ones give a little
-WHOLE_TURN_OF_OTHERS = {"rad": 360.0, "deg": 2 * np.pi, "°": 2 * np.pi}
-HOPS = 10  # samples of runs in which it is looked for what is jumped over
 LONGEST = 3_600  # time that is shown [s]
 # What the values of a task's attributes may be.
 RULES: dict[str, Rule] = {
@@ -123,7 +119,7 @@ def torn(task: Task) -> str:
         mjcf.place(model, data, qpos, task.mocap)
         mujoco.mj_fwdPosition(model, data)
         off = np.abs(data.efc_pos[: data.ne])
-        if off.max(initial=0.0) > TORN:
+        if off.max(initial=0.0) > 0.01:  # [m, rad]; soft ones give a little
             found.append((float(off.max()), int(data.efc_id[off.argmax()]), chart.format(point)))
     if not found:
         return ""
@@ -149,7 +145,7 @@ def jumped_over(task: Task) -> str:
     z = z[task.goes_on(z)]
     plant, u = task.placed(z, rng), task.draw_inputs(len(z), rng)
     with mujoco_log.kept(), suppress(BadInput):  # beside its chart a robot may be nowhere
-        for _ in range(HOPS):
+        for _ in range(10):  # samples
             before = plant.measurement
             plant.step(u)
             after = plant.measurement
@@ -197,7 +193,7 @@ def hidden_goal(task: Task, eps: float, everywhere: bool = False) -> str:
     goal = task.set_point
     if goal is None:
         z = chart.draw(OVERLAPS, rng)
-        for share in NEARER:  # of the chart's sides
+        for share in (0.1, 0.01, 0.001):  # of the chart's sides
             goal = z[task.miss(z).argmin()]
             z = np.vstack([goal, goal + share * chart.sides * box])
     goal = np.asarray(goal)
@@ -504,7 +500,8 @@ def _check_turns(task: Task, z: np.ndarray) -> None:
                 "stops it: leave the range out, or say that it is not periodic"
             )
         unit, side = chart.units[axis].strip("[] ").lower()[:3], chart.sides[axis]
-        if abs(side - WHOLE_TURN_OF_OTHERS.get(unit, 0.0)) < 0.01:
+        of_others = {"rad": 360.0, "deg": 2 * np.pi, "°": 2 * np.pi}
+        if abs(side - of_others.get(unit, 0.0)) < 0.01:
             raise BadInput(
                 f"its chart says that {chart.names[axis]} is in {chart.units[axis]} and comes back after "
                 f"{side:.6g}: a whole turn is 360 in degrees and 2 pi in rad, so correct one of them"

@@ -21,17 +21,7 @@ if TYPE_CHECKING:
 # A proof takes the lag that it measures into account.
 ALIKE = 1e-3
 ROUNDING = 1e-12  # of positions
-# Runs side by side, and the samples after which those that do not hold their input draw a new one.
-RUNS, HELD = 512, 8
-STATES = 4_000  # at which it is looked for ends that are a success
-# How far from the places of least `miss` it is looked then, as shares of the chart: each time a half to a
-# quarter as far. An end that is smaller than the last may be missed.
-NEARER = (0.05, 0.02, 0.005, 0.002, 0.0005)
-# Moves come close to the largest one, and do not reach it: where it depends smoothly on the state, those of
-# thousands of samples fall short of it by less than this share.
-MARGIN = 1e-3
-# Of robots with inertia one run in a thousand goes farther by some percent than all others.
-INERTIA = 0.05
+RUNS = 512  # side by side
 
 
 def begins_anew(task: Task, of_chart: bool = False) -> bool:
@@ -77,11 +67,14 @@ def ends_well(task: Task) -> bool:
     Where they do may be small: it is looked for nearer and nearer to where the task's `miss` is least, too.
     """
     rng, chart = np.random.default_rng(0), task.chart
+    # Of so many states; then of some as near to the best of them, as shares of the chart, each time a half to
+    # a quarter as far. An end that is smaller than the last may be missed.
+    states, nearer = 4_000, (0.05, 0.02, 0.005, 0.002, 0.0005)
     for beyond in (0.0, 0.1, 1.0, 10.0):
         by = np.where(chart.periodic, 0.0, beyond * chart.sides)
         low, high = chart.origin - by, chart.origin + chart.sides + by
-        z = rng.uniform(low, high, (STATES, chart.dimension))
-        for share in (*NEARER, 0.0):
+        z = rng.uniform(low, high, (states, chart.dimension))
+        for share in (*nearer, 0.0):
             with suppress(BadInput):  # a robot may be nowhere beyond its chart
                 if _some_reached(task, z, rng):
                     return True
@@ -150,10 +143,11 @@ def largest_moves(task: Task, inertia: bool = False) -> np.ndarray:
     active, largest = np.arange(len(z)), np.zeros(len(task.noisy))
     plant, (low, high) = task.placed(z, rng), task.input_limits
     u, kind = np.zeros((len(z), len(low))), active % (3 if inertia else 2)
+    held = 8  # samples after which runs that do not hold their input draw a new one
     for k in range(task.max_steps):
-        if inertia or k % HELD == 0:
+        if inertia or k % held == 0:
             drawn = low + (high - low) * rng.integers(3, size=u.shape) / 2
-            changes = (k == 0) | (kind == 2) | ((kind == 0) & (k % HELD == 0))
+            changes = (k == 0) | (kind == 2) | ((kind == 0) & (k % held == 0))
             u = np.where(changes[:, None], drawn, u)
         before = plant.measurement
         plant.step(u[active], active)
@@ -163,4 +157,7 @@ def largest_moves(task: Task, inertia: bool = False) -> np.ndarray:
         change = after[active] - before[active]
         change[:, :d] = chart.difference(after[active, :d], before[active, :d])
         largest = np.maximum(largest, np.abs(change).max(axis=0, initial=0.0))
-    return (1 + (INERTIA if inertia else MARGIN)) * largest
+    # Moves come close to the largest one, and do not reach it: where it depends smoothly on the state, those
+    # of thousands of samples fall short of it by less than a thousandth. Of robots with inertia one run in a
+    # thousand goes farther by some percent than all others.
+    return (1 + (0.05 if inertia else 1e-3)) * largest

@@ -35,9 +35,6 @@ from hyrl_mj.tasks.registry import alike, get_task, made_again
 STEPS, FEWEST = 200_000, 16
 STARTS = 32  # as training draws them
 ANYWHERE = 4_000  # places at which a task that is made again has to be the same
-NO_METRES = ("um", "mm", "cm", "dm", "km", "in", "ft", "rad", "deg", "°")
-LONGEST = 60  # that another process takes [s]
-MOST_HELD = 1_000  # entries of a list or the like that are looked at one by one
 # Samples after which an input must have changed something.
 EFFECT = 10
 # A whole turn of an angle, by its unit; who leaps over nearly that in a sample has crossed the seam.
@@ -168,7 +165,7 @@ def try_elsewhere(task: Task) -> None:
         command = [sys.executable, "-P", "-c", program, str(task.source), answers]
         own = os.environ | {"PYTHONHASHSEED": seed, "PYTHONPATH": places}
         with suppress(subprocess.TimeoutExpired):
-            subprocess.run(command, env=own, capture_output=True, timeout=LONGEST, check=False)
+            subprocess.run(command, env=own, capture_output=True, timeout=60, check=False)
         if not os.path.exists(answers):
             return
         with np.load(answers, allow_pickle=False) as file:
@@ -257,7 +254,7 @@ def _held(value: Any, names: Collection[str]) -> dict[str, Any]:
         return {"func": value.func, "the arguments": [value.args, value.keywords]}
     if isinstance(value, GeneratorType):
         return inspect.getgeneratorlocals(value)
-    if isinstance(value, list | tuple | dict) and len(value) <= MOST_HELD:
+    if isinstance(value, list | tuple | dict) and len(value) <= 1_000:  # more take long
         return {
             str(n): v for n, v in (value.items() if isinstance(value, dict) else enumerate(value))
         }
@@ -428,8 +425,9 @@ def try_place(task: Task) -> None:
             f"{task.plane} of the world, in metres: give the task a where(measured), or name another point "
             "in scene.tracked"
         )
+    others = ("um", "mm", "cm", "dm", "km", "in", "ft", "rad", "deg", "°")
     for name, unit in zip(task.chart.names[:2], task.chart.units, strict=False):
-        if unit.strip("[] ").lower() in NO_METRES:
+        if unit.strip("[] ").lower() in others:
             raise BadInput(
                 f"its chart's {name} is said to be in {unit}, and it is the place of {tracked} in metres: "
                 "say m"
