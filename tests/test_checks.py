@@ -142,6 +142,17 @@ MISTAKES = {
     "an input without effect": ((XML, 'kv="12"', 'kv="0"'), "input lateral changes nothing"),
     "a link too heavy": ((XML, 'mass="1"', 'mass="1e300"'), "input lateral changes nothing"),
     "a mass that is nan": ((XML, 'mass="1"', 'mass="nan"'), "XML contains a 'NaN'"),
+    "one level": ((PY, "levels=5", "levels=1"), r"1 levels of each of 1 input\(s\) cannot be used"),
+    "a chart that is none": ((PY, r"chart = Chart\(.*\)", "chart = None"), r"chart is None: .*\.Chart"),
+    "a side of no length": ((PY, r"\(3\.2, 1\.5\)", "(0.0, 1.5)"), "side that is not positive"),
+    "a control without end": ((XML, 'ctrl="1 0"', 'ctrl="inf 0"'), "key_ctrl in .* are not finite"),
+    "two sample times": ((XML, 'data="0.05"', 'data="0.05 0.05"'), r"sample_time .* 2 value\(s\): give it 1"),
+    "nothing to pass": ((XML, 'name="obstacle"', 'name="pillar"'), "xml has no obstacle: begin the name"),
+    "velocities in a row": ((PY, r"return z, np\.stack.*", "return z, z[:, 0]"), r"qvel has shape \(64,\)"),
+    "an observation that counts": (
+        (PY, OBSERVED, "self.n = getattr(self, 'n', 0) + 1\n        return measured[:, :3] + self.n" + THEN),
+        r"measured\(\) is not the inverse of observation\(\)",
+    ),
     "a sparse Jacobian": ((XML, "<option", '<option jacobian="sparse"'), r'4\.0\.0.*jacobian="dense"'),
 }  # fmt: skip
 
