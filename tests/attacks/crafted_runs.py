@@ -1,8 +1,6 @@
 """Run directories of a stranger: payloads, links, bombs, lies. None may do harm, whatever is done with it."""
 
-import io
 import os
-import pickle
 import struct
 import zipfile
 import zlib
@@ -15,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from attacks import MARKER
-from attacks.crafted_agents import ESCAPE, Payload, header, overlapping, zeros
+from attacks.crafted_agents import ESCAPE, header, overlapping, zeros
 from attacks.forgery import arrays, changed, forged, replaced, setting
 
 SCRIPT = "<script>alert('executed')</script>"
@@ -31,10 +29,6 @@ def evil(folder: Path, name: str = "evil.py") -> Path:
     path = folder / name
     path.write_text(f"open({str(folder / MARKER)!r}, 'w').close()\nclass X: pass\n")
     return path
-
-
-def names_code(folder: Path, path: Path, name: str, key: str) -> None:
-    changed(path, name, lambda content: content.update({key: str(evil(folder))}))
 
 
 def config_names_code(folder: Path, path: Path, task: str) -> None:
@@ -58,26 +52,11 @@ def names_module(folder: Path, path: Path, stage: str) -> None:
     changed(path, "config.json", lambda c: c["settings"][stage].update(algorithm="evilmod:X"))
 
 
-def policy_names_module(folder: Path, path: Path) -> None:
-    evil(folder, "evilmod.py")
-    changed(path, "mode_0.json", lambda content: content.update(algorithm="evilmod:X"))
-
-
-def pickled_array(folder: Path, path: Path) -> None:
-    buffer = io.BytesIO()
-    np.save(buffer, np.array([Payload()], dtype=object), allow_pickle=True)
-    arrays(path, "critical_set.npz", points=buffer.getvalue())
-
-
 def calls_in_header(folder: Path, path: Path) -> None:
     text = f"{{'descr': '<f8', 'fortran_order': False, 'shape': (open({MARKER!r}, 'w').fileno(),)}}"
     raw = text.encode().ljust(118) + b"\n"
     magic = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(raw)) + raw
     arrays(path, "critical_set.npz", points=magic + bytes(8))
-
-
-def pickle_for_json(folder: Path, path: Path) -> None:
-    replaced(path, "robustness.json", pickle.dumps(Payload()))
 
 
 # ---- shapes and sizes
@@ -183,11 +162,6 @@ def claims(stages: dict[str, Any], *names: str) -> None:
         stages["simulate"]["outputs"][name] = "0" * 64
 
 
-def in_a_circle(stages: dict[str, Any]) -> None:
-    last = stages["report"]["outputs"]
-    stages["train"]["inputs"] = dict(last)
-
-
 def text(folder: Path, path: Path, name: str, content: str) -> None:
     (path / name).write_text(content, encoding="utf-8", errors="surrogatepass")
 
@@ -210,10 +184,6 @@ def versions_say(folder: Path, path: Path, what: str) -> None:
 
 
 DIRECTORIES: dict[str, Callable[[Path, Path], None]] = {
-    "mode_0.json names a file of code": partial(names_code, name="mode_0.json", key="task"),
-    "policy.json names a file of code": partial(names_code, name="policy.json", key="task"),
-    "mode_0.json names a module": policy_names_module,
-    "config.json names a file of code": partial(config_names_code, task="{folder}/evil.py"),
     "config.json names a file of code in itself": partial(config_names_code, task="{path}/evil.py"),
     "config.json names a file of code near by": partial(config_names_code, task="evil.py"),
     "config.json names a file of code of 4 GB": partial(names_endless_code, text=""),
@@ -222,9 +192,7 @@ DIRECTORIES: dict[str, Callable[[Path, Path], None]] = {
     ),
     "config.json names a module for stage 1": partial(names_module, stage="stage1"),
     "config.json names a module for stage 6": partial(names_module, stage="stage6"),
-    "a pickled array": pickled_array,
     "a call in the header of an array": calls_in_header,
-    "a pickle for a JSON file": pickle_for_json,
     "an npz bomb": array_bomb,
     "an npz whose arrays overlap": overlapping_arrays,
     "an array of 2**50 numbers": lambda folder, path: arrays(
@@ -303,9 +271,6 @@ DIRECTORIES: dict[str, Callable[[Path, Path], None]] = {
     },
     "arcs is a file": partial(file_for_folder, name="arcs"),
     "figures is a file": partial(file_for_folder, name="figures"),
-    "the manifest claims files above": partial(
-        manifest, change=lambda stages: claims(stages, "../victim/secret.txt", "arcs/../../victim/secret.txt")
-    ),
     "the manifest claims a name in two lines": partial(
         manifest, change=lambda stages: claims(stages, "arcs/start1_policy.npz\n")
     ),
@@ -316,7 +281,6 @@ DIRECTORIES: dict[str, Callable[[Path, Path], None]] = {
     "the manifest has a stage that nobody knows": partial(
         manifest, change=lambda stages: stages.update({ESCAPE: stages["train"]})
     ),
-    "the manifest's stages read each other": partial(manifest, change=in_a_circle),
     "a deep config.json": partial(text, name="config.json", content="[" * 10**5 + "]" * 10**5),
     "a config.json with half a character": partial(
         text, name="config.json", content='{"kind": "run", "version": 2, "a": "\\ud800"}'
