@@ -30,10 +30,10 @@ OFF_POLICY = (DQN, SAC, TD3, DDPG)
 DEFAULT = {PPO: "tanh", A2C: "tanh", DQN: "relu", SAC: "relu", TD3: "relu", DDPG: "relu"}
 
 
-def untrained(algorithm, task, **kwargs):
+def untrained(algorithm, task, wrap=lambda env: env, **kwargs):
     """An SB3 algorithm on a task, with random weights that use the whole range of its inputs."""
     options = {"buffer_size": 10} if algorithm in OFF_POLICY else {}
-    env = TaskVecEnv(BatchedEnv(task, 1))
+    env = wrap(TaskVecEnv(BatchedEnv(task, 1)))
     model = algorithm("MlpPolicy", env, seed=0, device="cpu", policy_kwargs=kwargs, **options)
     for parameter in model.policy.parameters():
         parameter.data = 1.5 * torch.randn(parameter.shape) / parameter.shape[-1] ** 0.5

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from environments import Flat
+from sentences import refused
 from stable_baselines3 import A2C, DQN, PPO, SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from test_agents import (
@@ -39,14 +40,6 @@ from hyrl_mj.policies import pickled, sb3_zip, torch_file
 def agent(circle, tmp_path):
     """A PPO agent on the unit circle."""
     return saved(untrained(PPO, circle, net_arch=[8]), tmp_path)
-
-
-def refused(path, task, message):
-    with pytest.raises(BadArtifact, match=message) as error:
-        load_agent(path, task)
-    assert str(path) in str(error.value)
-    assert "\n" not in str(error.value)
-    assert len(str(error.value)) < 800
 
 
 def with_metadata(path, **entries):

@@ -7,9 +7,10 @@ import onnx
 import pytest
 from memory import Peak
 from onnx import TensorProto, helper, numpy_helper
+from sentences import refused
 
 import hyrl_mj
-from hyrl_mj import BadArtifact, load_agent
+from hyrl_mj import load_agent
 from hyrl_mj.system import limits
 
 FLOAT, INT, BOOL = TensorProto.FLOAT, TensorProto.INT64, TensorProto.BOOL
@@ -56,13 +57,6 @@ HALF = helper.make_graph([node("Identity", "g", "z")], "h", [], [value("z", FLOA
 def function(name, *nodes, domain="mine"):
     opsets = [helper.make_opsetid("", 18), helper.make_opsetid("mine", 1)]
     return helper.make_function(domain, name, ["a"], ["r"], list(nodes), opsets)
-
-
-def refused(path, task, message):
-    with pytest.raises(BadArtifact, match=message) as error:
-        load_agent(path, task)
-    assert str(path) in str(error.value)
-    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(

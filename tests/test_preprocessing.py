@@ -10,7 +10,7 @@ from planted import Payload, random_states
 from stable_baselines3 import DQN, PPO, SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
-from test_agents import OFF_POLICY, Lopsided, onnx_file, saved
+from test_agents import Lopsided, onnx_file, saved, untrained
 
 import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, Noise, load_agent, simulate
@@ -47,12 +47,8 @@ def normalizer(env):
 
 def agent(algorithm, task, folder, wrap):
     """An SB3 agent with random weights in a wrapped environment, its zip, and what `load_agent` needs."""
-    env = wrap(TaskVecEnv(BatchedEnv(task, 1, threads=1)))
-    options = {"buffer_size": 10} if algorithm in OFF_POLICY else {}
-    kwargs = {"net_arch": [16]}
-    model = algorithm("MlpPolicy", env, seed=0, device="cpu", policy_kwargs=kwargs, **options)
-    for parameter in model.policy.parameters():
-        parameter.data = 1.5 * torch.randn(parameter.shape) / parameter.shape[-1] ** 0.5
+    model = untrained(algorithm, task, wrap, net_arch=[16])
+    env = model.get_env()
     needs = {"n_stack": 3 if env.observation_space.shape[0] > len(task.observation_low) else 1}
     if (found := normalizer(env)) is not None:
         rng = np.random.default_rng(0)
