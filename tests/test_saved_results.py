@@ -67,14 +67,6 @@ def test_sets_of_another_task_are_refused(tmp_path, circle, grid_set):
         ExtendedSets.load(tmp_path / "e.npz", circle)
 
 
-def test_one_artifact_is_not_another(tmp_path, vehicle, grid_set):
-    Partition((0,), (grid_set,), grid_set.mask).save(tmp_path / "p.npz")
-    with pytest.raises(BadArtifact, match="'partition', not 'extended sets'"):
-        ExtendedSets.load(tmp_path / "p.npz", vehicle)
-    with pytest.raises(BadArtifact, match="'partition', not 'critical set'"):
-        CriticalSet.load(tmp_path / "p.npz")
-
-
 def test_sets_that_do_not_fit_their_grid_are_refused(tmp_path, vehicle, grid_set):
     arrays = {
         "modes": np.array([0]),

@@ -378,8 +378,3 @@ def test_two_controllers_meet_the_same_noise(vehicle):
 def test_what_cannot_be_simulated_is_refused(vehicle, options, says):
     with pytest.raises(BadInput, match=says):
         simulate(vehicle, ideal_controller(vehicle), **{"z0": np.zeros(2), **options})
-
-
-def test_a_policy_has_one_mode(vehicle):
-    with pytest.raises(BadInput, match=r"mode 1 is unknown: choose one of \(0,\)"):
-        simulate(vehicle, sign_policy(vehicle), np.zeros(2), q0=1)
