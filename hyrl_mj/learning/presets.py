@@ -130,11 +130,6 @@ _MODES_DISCRETE = replace(
     episode=None,
     options={**_SMALL.options, "ent_coef": 0.003, "gae_lambda": 0.9},
 )
-_MODES_PAPER_CONTINUOUS = replace(
-    _PAPER, samples=100_000, hidden=(112, 112), learning_rate=3.45e-4, gamma=0.9637
-)
-_MODES_PAPER_DISCRETE = replace(_PAPER, algorithm="dqn", samples=300_000, warm_start=True)
-_SMOKE_MODES = 8_192
 # Grid points along the longest side of the chart, by its dimension (4: or more), for the search of M* and for
 # the sets; fewer for plants with dynamics, whose samples are slower to simulate.
 _GRIDS = {1: (120, 2880), 2: (120, 240), 3: (24, 48), 4: (11, 13)}
@@ -237,13 +232,16 @@ def _stage1(task: Task, name: str, algorithm: str) -> Training:
 def _stage6(task: Task, name: str, algorithm: str) -> Training:
     """Returns the training of stage 6 after stage 1 with an algorithm."""
     continuous = task.learning.levels is None
+    if name == "paper" and continuous:
+        return replace(
+            _PAPER, samples=100_000, hidden=(112, 112), learning_rate=3.45e-4, gamma=0.9637
+        )
     if name == "paper":
-        training = _MODES_PAPER_CONTINUOUS if continuous else _MODES_PAPER_DISCRETE
-        return replace(training, warm_start=training.warm_start and training.algorithm == algorithm)
+        return replace(_PAPER, algorithm="dqn", samples=300_000, warm_start=algorithm == "dqn")
     usual = _MODES_CONTINUOUS if continuous else _MODES_DISCRETE
     training = _with(usual, task, "modes")
     if name == "smoke":
-        return replace(training, samples=_SMOKE_MODES, attempts=1)
+        return replace(training, samples=8_192, attempts=1)
     most = task.effort.trainings
     return training if most is None else replace(training, attempts=min(training.attempts, most))
 

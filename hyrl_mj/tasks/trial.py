@@ -37,8 +37,6 @@ STARTS = 32  # as training draws them
 ANYWHERE = 4_000  # places at which a task that is made again has to be the same
 # Samples after which an input must have changed something.
 EFFECT = 10
-# A whole turn of an angle, by its unit; who leaps over nearly that in a sample has crossed the seam.
-TURNS, NEARLY = {"rad": 2 * np.pi, "deg": 360.0, "°": 360.0}, 0.9
 # Number of the sample -> inputs (n, m).
 Inputs = Callable[[int], np.ndarray]
 # Indices (k,) of rows -> what a method gives for them (k, ...).
@@ -490,10 +488,12 @@ def _play(task: Task, z: np.ndarray, inputs: Inputs, kind: str) -> np.ndarray:
 def _check_seam(task: Task, before: np.ndarray, after: np.ndarray) -> None:
     """Raises `BadInput` if an angle that is not said to be periodic goes on at its other end."""
     chart = task.chart
+    turns = {"rad": 2 * np.pi, "deg": 360.0, "°": 360.0}
     for axis, unit in enumerate(chart.units):
         leap = np.abs(after[:, axis] - before[:, axis])
-        turn = TURNS.get(unit.strip("[] ").lower(), np.inf)
-        if not chart.periodic[axis] and leap.max() > NEARLY * turn:
+        turn = turns.get(unit.strip("[] ").lower(), np.inf)
+        # Who leaps over nearly a whole turn in a sample has crossed the seam.
+        if not chart.periodic[axis] and leap.max() > 0.9 * turn:
             row = int(leap.argmax())
             raise BadInput(
                 f"within one sample {chart.names[axis]} leaps from {before[row, axis]:.3g} to "
