@@ -1,4 +1,4 @@
-"""Attacks hyrl_mj: crashes, kills, damaged and crafted files, rivals, bad machines.
+"""Attacks hyrl_mj: crashes, kills, damaged and crafted files, wrong settings, rivals, bad machines.
 
     python tests/attack.py                        # all of it
     python tests/attack.py --short                # a sample of each attack
@@ -32,6 +32,7 @@ from random import Random
 
 from attacks import (
     Trial,
+    configurations,
     crashes,
     damage,
     disks,
@@ -77,6 +78,9 @@ ATTACKS = {
     "agents": Attack("crafted agents of a stranger", received.agents, 100, 2),
     "received": Attack("crafted run directories of a stranger", received.runs, 25, 1),
     "doors": Attack("generated descriptions of a stranger", doors.trials, 575, 8),
+    "configurations": Attack(
+        "one setting changed, through every stage", configurations.trials, 200, 4
+    ),
     "writers": Attack("two and four writers, and a reader", writers.trials, 4, 1),
     "surroundings": Attack("pairs of bad surroundings", surroundings.trials, 4, 1),
 }
