@@ -1,5 +1,7 @@
 """For tests of figures: the pixels of a PNG, and planted artifacts to draw."""
 
+from types import SimpleNamespace
+
 import numpy as np
 from matplotlib.colors import to_rgb
 from PIL import Image
@@ -14,9 +16,8 @@ from planted import (
 )
 
 from hyrl_mj import Noise, simulate
-from hyrl_mj.runs.arcs import overview_arcs, policy_start_arcs
-from hyrl_mj.viz.figures import ShownRun, style
-from hyrl_mj.viz.section import Section
+from hyrl_mj.learning.presets import preset
+from hyrl_mj.viz.figures import Shown, style
 
 EPS = 0.1
 
@@ -70,18 +71,22 @@ def arcs_of(task):
     return arcs
 
 
-def shown_of(task, arcs):
-    """Returns what the figures show of a planted run with these replays."""
-    policy = policy_of(task)
-    return ShownRun(
-        Section(task),
-        "DQN",
-        policy,
-        decisions(task),
-        halves(task),
-        noisy=arcs["critical", "policy"],
-        noiseless=tuple(overview_arcs(task, policy)),
-        paper=tuple(policy_start_arcs(task, policy, EPS, 0)),
-        sets=sets_of(task),
-        replays=arcs,
+def planted_run(task, arcs=None, **settings):
+    """Returns a run whose artifacts are known, with these replays, and settings that differ."""
+    return SimpleNamespace(
+        task=task,
+        settings=preset(task, **settings),
+        policy=policy_of(task),
+        policy_title="RL policy (DQN)",
+        steady=policy_of(task),
+        controller=controller_of(task),
+        critical_set=decisions(task),
+        partition=halves(task),
+        extended_sets=sets_of(task),
+        arcs=lambda: arcs or arcs_of(task),
     )
+
+
+def shown_of(task, arcs=None):
+    """Returns what the figures show of a planted run with these replays."""
+    return Shown(planted_run(task, arcs))

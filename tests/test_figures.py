@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from base64 import b64decode
+from copy import copy
 from dataclasses import replace
 from html import unescape
 from types import SimpleNamespace
@@ -29,7 +30,6 @@ from planted import Cube, decisions, extended, plane_policy, without_pictures
 
 import hyrl_mj
 from hyrl_mj import BadInput, HybridController, Outcome, Scene, simulate
-from hyrl_mj.runs.arcs import overview_arcs, policy_start_arcs
 from hyrl_mj.sets import Everything, Grid, GridSet
 from hyrl_mj.stages.partition import Partition
 from hyrl_mj.viz import colours, figures
@@ -45,14 +45,16 @@ NONE = hyrl_mj.CriticalSet(np.empty((0, 2)), np.zeros(0, dtype=int), 0.01, 0.1)
 
 
 SHOWN = {task.name: shown_of(task, ARCS[task.name]) for task in (CIRCLE, VEHICLE)}
-NAMES = figures.names(VEHICLE, figures.ShownRun)
+NAMES = figures.names(VEHICLE, "policy", "controller")
 OURS = ("overview", "policy", "extended_sets", "runs")
 EVERY_FIGURE = pytest.mark.parametrize("name", NAMES)
 
 
 def draw(name, task, path=None, /, **changes):
     """Draws a figure of the planted run, with some of what it shows replaced."""
-    return written(figures.FIGURES[name].draw(replace(SHOWN[task.name], **changes)), path)
+    shown = copy(SHOWN[task.name])
+    vars(shown).update(changes)
+    return written(figures.FIGURES[name].draw(shown), path)
 
 
 def lines_of(panel, colour, style="-"):
@@ -171,13 +173,11 @@ def test_a_failed_write_leaves_nothing(tmp_path, monkeypatch, fails):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_every_figure_is_drawn_from_one_kind_of_value_and_has_a_caption():
-    kinds = figures.ShownPolicy, figures.ShownRun, figures.ShownGame
-    policy, run, game = (figures.names(VEHICLE, kind) for kind in kinds)
-    assert {"overview", "policy"} <= set(policy) <= set(run)
-    assert set(OURS) <= set(run)
-    assert {"robustness_map", "robustness_curve"} <= set(game)
-    assert sorted([*run, *game]) == sorted(figures.FIGURES)
+def test_every_figure_is_of_one_kind_and_has_a_caption():
+    policy, controller, game = (
+        figures.names(VEHICLE, kind) for kind in ("policy", "controller", "game")
+    )
+    assert sorted([*policy, *controller, *game]) == sorted(figures.FIGURES)
     assert all(entry.caption.endswith(".") for entry in figures.FIGURES.values())
 
 
@@ -189,10 +189,9 @@ def test_a_new_figure_is_an_entry(tmp_path, monkeypatch):
         with style.drawing(1.0, shown.task, shown.policy_title) as figure:
             return figure
 
-    monkeypatch.setitem(
-        figures.FIGURES, "title", figures.Entry(draw_title, figures.ShownPolicy, "The title.")
-    )
-    assert figures.draw_all(SHOWN["vehicle"], tmp_path) == (*NAMES, "title")
+    monkeypatch.setitem(figures.FIGURES, "title", figures.Entry(draw_title, "policy", "The title."))
+    drawn = figures.draw_all(SHOWN["vehicle"], tmp_path, "policy", "controller")
+    assert drawn == (*NAMES, "title")
     assert {path.stem for path in tmp_path.iterdir()} == {*NAMES, "title"}
     assert [picture.caption for picture in pictures(tmp_path)][-1] == "The title."
 
@@ -201,10 +200,10 @@ def test_of_one_coordinate_that_is_not_periodic_only_the_runs_are_drawn():
     class Line(type(CIRCLE)):
         chart = hyrl_mj.Chart(("a",), ("m",), (0.0,), (1.0,), (False,))
 
-    assert figures.names(Line(), figures.ShownRun) == ("runs",)
+    assert figures.names(Line(), "policy", "controller") == ("runs",)
     for name in ("overview", "policy", "extended_sets"):
         with pytest.raises(BadInput, match="one coordinate, a, which is not periodic"):
-            draw(name, CIRCLE, section=Section(Line()))
+            draw(name, CIRCLE, task=Line())
 
 
 def test_tints_are_the_colours_with_white():
@@ -408,22 +407,16 @@ def test_of_three_dimensions_a_section_is_drawn_and_the_runs_over_time():
     arcs = {("start0", "policy"): simulate(cube, policy, starts)[0]}
     for q in (0, 1):
         arcs["start0", f"hyrl_q{q}"] = simulate(cube, loop, starts, q0=q)[0]
-    section = Section(cube)
-    grid = Grid.with_cells(section.chart, 20)
+    run = SimpleNamespace(
+        task=cube, policy_title="RL policy (PPO)", steady=policy, arcs=lambda: arcs,
+        settings=SimpleNamespace(stage1=SimpleNamespace(title="PPO"), eps=EPS, seed=0),
+    )  # fmt: skip
+    shown = figures.Shown(run)
+    grid = Grid.with_cells(shown.section.chart, 20)
     half = GridSet(grid, grid.nodes[:, 0])
-    shown = figures.ShownRun(
-        section,
-        "PPO",
-        policy,
-        NONE,
-        Partition((0, 1), (half, ~half), half.mask),
-        noisy=arcs["start0", "policy"],
-        noiseless=tuple(overview_arcs(cube, policy)),
-        paper=tuple(policy_start_arcs(cube, policy, EPS, 0)),
-        sets=extended([half, ~half]),
-        replays=arcs,
-    )
-    assert figures.names(cube, figures.ShownRun) == NAMES
+    parts = Partition((0, 1), (half, ~half), half.mask)
+    vars(shown).update(critical=NONE, partition=parts, sets=extended([half, ~half]))
+    assert figures.names(cube, "policy", "controller") == NAMES
     for draw_one in (figures.draw_overview, figures.draw_policy_map, figures.draw_extended_sets):
         figure = draw_one(shown)
         assert figure.get_suptitle().startswith("Cube at c = -0.3 m: ")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import matplotlib
 import numpy as np
 import pytest
@@ -90,13 +92,14 @@ def critical_of(*points):
 
 
 def draw_map(task, result, maps, critical, path=None):
-    shown = figures.ShownGame(Section(task), critical, result, maps)
+    shown = SimpleNamespace(
+        task=task, section=Section(task), critical=critical, result=result, maps=maps
+    )
     return written(figures.draw_robustness_map(shown), path)
 
 
 def draw_curve(task, result, path=None):
-    maps = maps_of(task, [], lambda z: np.zeros(len(z)), cells=8)
-    shown = figures.ShownGame(Section(task), critical_of(), result, maps)
+    shown = SimpleNamespace(task=task, section=Section(task), result=result)
     return written(figures.draw_robustness_curve(shown), path)
 
 

@@ -1,6 +1,7 @@
 """Figures and replays of runs with more than two modes, whose numbers have gaps and whose names are long."""
 
 from itertools import combinations
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -67,12 +68,14 @@ def shown():
         arcs |= {(f"start{i}", who): arc for i, arc in enumerate(found)}
     quiet = tuple(simulate(task, task.policy(), starts))
     winning = (np.ones(grid.size, dtype=bool),) * len(modes)
-    return figures.ShownRun(
-        Section(task),
-        "PPO",
-        task.policy(),
-        CriticalSet(np.zeros((1, 2)), np.zeros(1, dtype=int), 0.01, 0.05),
-        Partition(modes, parts, winning[0]),
+    return SimpleNamespace(
+        task=task,
+        section=Section(task),
+        algorithm="PPO",
+        policy_title="RL policy (PPO)",
+        policy=task.policy(),
+        critical=CriticalSet(np.zeros((1, 2)), np.zeros(1, dtype=int), 0.01, 0.05),
+        partition=Partition(modes, parts, winning[0]),
         noisy=arcs["start0", "policy"],
         noiseless=quiet,
         paper=tuple(arcs[f"start{i}", "policy"] for i in range(3)),

@@ -2,12 +2,11 @@
 
 import importlib.util
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from figure_parts import arcs_of, controller_of, policy_of, sets_of
-from planted import decisions, halves, without_pictures
+from figure_parts import arcs_of, planted_run
+from planted import without_pictures
 
 import hyrl_mj
 from hyrl_mj.learning.presets import preset
@@ -17,21 +16,6 @@ SCRIPT = Path(__file__).parents[1] / "scripts" / "reproduce_paper.py"
 spec = importlib.util.spec_from_file_location("reproduce_paper", SCRIPT)
 script = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(script)
-
-
-def planted_run(task, arcs=None, **settings):
-    """A run whose artifacts are known."""
-    return SimpleNamespace(
-        task=task,
-        settings=preset(task, **settings),
-        policy=policy_of(task),
-        steady=policy_of(task),
-        controller=controller_of(task),
-        critical_set=decisions(task),
-        partition=halves(task),
-        extended_sets=sets_of(task),
-        arcs=lambda: arcs or arcs_of(task),
-    )
 
 
 def table_of(lines):

@@ -263,7 +263,8 @@ def draw_robustness(run: Run, found: Examination, folder: Path) -> None:
 
     assert found.robustness.game is not None
     assert found.maps is not None
-    figures.draw_all(figures.shown_game(run, found.robustness.game, found.maps), folder)
+    shown = figures.Shown(run, game=found.robustness.game, maps=found.maps)
+    figures.draw_all(shown, folder, "game")
 
 
 def simulate_stage(run: Run, say: Say) -> None:
@@ -279,7 +280,7 @@ def figures_stage(run: Run, say: Say) -> None:
     from hyrl_mj.viz import figures
 
     folder = run.path / "figures"
-    drawn = figures.draw_all(figures.shown_run(run), folder)
+    drawn = figures.draw_all(figures.Shown(run), folder, "policy", "controller")
     say(f"{', '.join(drawn)} in {folder}, as PNG and PDF")
 
 
@@ -316,7 +317,7 @@ def diagnose_stage(run: Run, say: Say) -> None:
     found = examine(subject_of(run, alone, run.partition))
     losses = losses_of(run)
     arc = worst_arc(run, losses)
-    figures.draw_all(figures.shown_policy(run, arc or usual_arc(run)), folder)
+    figures.draw_all(figures.Shown(run, arc or usual_arc(run)), folder, "policy")
     if found.maps is not None:
         draw_robustness(run, found, folder)
     diagnosis.write_worst(run, arc, say)

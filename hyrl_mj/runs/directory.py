@@ -272,6 +272,11 @@ class Run:
         return found
 
     @cached_property
+    def maps(self) -> Maps:
+        """The class of every node of the worst-case game, from `robustness.npz`."""
+        return Maps.load(self._checked("robustness.npz"))
+
+    @cached_property
     def arrivals(self) -> Arrivals:
         """From how many starts the policy of stage 1, or the agent, arrives without noise."""
         return Arrivals.load(self._checked("arrivals.json"))
@@ -370,7 +375,7 @@ class Run:
                     f"hyrl-mj robustness {self.path} again"
                 )
             return np.reshape(found, (-1, self.task.chart.dimension))
-        maps = Maps.load(self._checked("robustness.npz"))
+        maps = self.maps
         z = maps.grid(self.task.chart).nodes
         return z[(maps.map[controller] == MapClass.BEATEN) & self.task.may_start(z)]
 

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hyrl_mj.errors import BadInput, unknown
-from hyrl_mj.judging.game import Maps
 from hyrl_mj.policies import AnyPolicy
 from hyrl_mj.runs import directory
 from hyrl_mj.simulation import AnyNoise
@@ -104,18 +103,13 @@ class Run(directory.Run):
 
         Raises:
             BadInput: there is no such figure, or the chart cannot be drawn so.
-            BadArtifact: its stages, or for all but the robustness the replays, have not run.
+            BadArtifact: a stage that it shows has not run.
         """
-        from hyrl_mj.viz.figures import FIGURES, ShownGame, shown_game, shown_run
+        from hyrl_mj.viz.figures import FIGURES, Shown
 
         if figure not in [*FIGURES]:
             raise unknown("figure", figure, FIGURES)
-        if FIGURES[figure].shows is not ShownGame:
-            return FIGURES[figure].draw(shown_run(self))
-        if (game := self.robustness.game) is None:
-            raise BadInput(f"there is no {figure}: no game is played, because {self.why_no_game}")
-        maps = Maps.load(self._checked("robustness.npz"))
-        return FIGURES[figure].draw(shown_game(self, game, maps))
+        return FIGURES[figure].draw(Shown(self))
 
     def simulate(
         self,

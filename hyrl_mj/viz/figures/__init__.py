@@ -8,7 +8,6 @@ function in a module here and an entry of `FIGURES`.
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from matplotlib.figure import Figure
 
@@ -27,14 +26,7 @@ from hyrl_mj.viz.figures.robustness import (
     draw_robustness_map,
 )
 from hyrl_mj.viz.figures.runs import draw_runs
-from hyrl_mj.viz.figures.shown import (
-    ShownGame,
-    ShownPolicy,
-    ShownRun,
-    shown_game as shown_game,
-    shown_policy as shown_policy,
-    shown_run as shown_run,
-)
+from hyrl_mj.viz.figures.shown import Shown
 
 
 @dataclass(frozen=True)
@@ -43,13 +35,13 @@ class Entry:
 
     Attributes:
         draw: shown -> the figure.
-        shows: the type that `draw` takes; the stage that makes such a value draws the figure.
+        of: what it shows, "policy", "controller" or "game"; the stage that makes that draws the figure.
         caption: one or two sentences for the report.
         flat: whether the figure needs a chart, or a section of it, that is a plane or a ring.
     """
 
-    draw: Callable[[Any], Figure]
-    shows: type[ShownPolicy | ShownGame]
+    draw: Callable[[Shown], Figure]
+    of: str
     caption: str
     flat: bool = True
 
@@ -58,7 +50,7 @@ class Entry:
 FIGURES = {
     "overview": Entry(
         draw_overview,
-        ShownPolicy,
+        "policy",
         "Where the stage-1 policy goes without noise, in the colour of the mode whose way it is, and "
         "where measurement noise leads it from one start. The red field is all that it can observe along "
         "that path, and the dots are what it does observe. Of the other colours, each is the part of one "
@@ -66,31 +58,31 @@ FIGURES = {
     ),
     "policy": Entry(
         draw_policy_map,
-        ShownPolicy,
+        "policy",
         "The input that the stage-1 policy gives at each measurement, with the critical set M* in red, "
         "and its runs from the scene's starts under measurement noise.",
     ),
     "extended_sets": Entry(
         draw_extended_sets,
-        ShownRun,
+        "controller",
         "The extended set of each mode, and where they overlap: the overlap over the critical set M* is "
         "the hysteresis that is to keep noise from flipping the mode.",
     ),
     "robustness_map": Entry(
         draw_robustness_map,
-        ShownGame,
+        "game",
         "What becomes of runs from each state when an adversary picks the worst noise at every sample.",
         flat=False,
     ),
     "robustness_curve": Entry(
         draw_robustness_curve,
-        ShownGame,
+        "game",
         "How much of the winnable start region is won against the worst noise, over its bound.",
         flat=False,
     ),
     "runs": Entry(
         draw_runs,
-        ShownRun,
+        "controller",
         "The hybrid controller and the stage-1 policy from the scene's starts under the same "
         "measurement noise, for each start mode.",
         flat=False,
@@ -98,20 +90,23 @@ FIGURES = {
 }
 
 
-def names(task: Task, shows: type[ShownPolicy | ShownGame]) -> tuple[str, ...]:
-    """Returns the names of the figures of a type of value that the task's chart allows."""
+def names(task: Task, *kinds: str) -> tuple[str, ...]:
+    """Returns the names of the figures of these kinds, as `Entry.of`, that the task's chart allows."""
     return tuple(
         name
         for name, entry in FIGURES.items()
-        if issubclass(shows, entry.shows) and (drawable(task.chart) or not entry.flat)
+        if entry.of in kinds and (drawable(task.chart) or not entry.flat)
     )
 
 
-def draw_all(shown: ShownPolicy | ShownGame, folder: Path) -> tuple[str, ...]:
-    """Writes every figure of a value into a folder, and returns their names."""
-    drawn = names(shown.task, type(shown))
-    if isinstance(shown, ShownGame) and shown.result.estimate:  # of a few bounds there is no curve
+def draw_all(shown: Shown, folder: Path, *kinds: str) -> tuple[str, ...]:
+    """Writes every figure of these kinds into a folder, and returns their names."""
+    drawn = names(shown.task, *kinds)
+    if "game" in kinds and shown.result.estimate:  # of a few bounds there is no curve
         drawn = tuple(name for name in drawn if name != "robustness_curve")
     for name in drawn:
         style.write(FIGURES[name].draw(shown), folder / f"{name}.png")
     return drawn
+
+
+shown_run = Shown  # `draw_runs(shown_run(run))`, as the manual has it

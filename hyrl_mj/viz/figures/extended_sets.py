@@ -14,14 +14,14 @@ from hyrl_mj.sets import Chart, GridSet
 from hyrl_mj.viz.colours import BAD, INK, OVERLAP, mode_colour
 from hyrl_mj.viz.figures import charts, style
 from hyrl_mj.viz.figures.charts import OUTER
-from hyrl_mj.viz.figures.shown import ShownRun
+from hyrl_mj.viz.figures.shown import Shown
 from hyrl_mj.viz.tables import NAMED
 
 LETTERS = 40  # of a line above a panel of two
 CORE, GAP = 0.6, 0.05  # the inner radius of the innermost ring, and the gap between rings
 
 
-def draw_extended_sets(shown: ShownRun) -> Figure:
+def draw_extended_sets(shown: Shown) -> Figure:
     """Draws the extended sets and their overlap; in a plane, with an enlargement around M*.
 
     Where they are more than can be told apart, each has a panel of its own.
@@ -52,7 +52,7 @@ def draw_extended_sets(shown: ShownRun) -> Figure:
     return figure
 
 
-def _draw_each(shown: ShownRun, shared: np.ndarray, title: str) -> Figure:
+def _draw_each(shown: Shown, shared: np.ndarray, title: str) -> Figure:
     """Draws each set of a plane in a panel of its own, and what of it other sets hold, too (N,)."""
     sets, (width, height) = shown.sets, shown.section.chart.sides
     rows = -(-len(sets.sets) // style.COLUMNS)
@@ -78,7 +78,7 @@ def _draw_each(shown: ShownRun, shared: np.ndarray, title: str) -> Figure:
     return figure
 
 
-def _set_rings(panel: Axes, shown: ShownRun, shared: np.ndarray) -> None:
+def _set_rings(panel: Axes, shown: Shown, shared: np.ndarray) -> None:
     """Draws a ring for each set, with its ends beside it."""
     chart, sets = shown.task.chart, shown.sets
     charts.arcs(panel, chart, shared.astype(int), (None, OVERLAP), OUTER, CORE)
@@ -103,7 +103,7 @@ def _ends(panel: Axes, chart: Chart, members: GridSet, radius: float, colour: st
         panel.text(x, y, text, color=colour, ha="center", va="center", fontsize=9)
 
 
-def _set_plane(panel: Axes, shown: ShownRun, shared: np.ndarray) -> None:
+def _set_plane(panel: Axes, shown: Shown, shared: np.ndarray) -> None:
     """Fills the sets in a plane, with outlines."""
     sets = shown.sets
     for i, members in enumerate(sets.sets):
@@ -115,7 +115,7 @@ def _set_plane(panel: Axes, shown: ShownRun, shared: np.ndarray) -> None:
     charts.dots(panel, shown.critical.points)
 
 
-def _enlarge(whole: Axes, near: Axes, shown: ShownRun) -> None:
+def _enlarge(whole: Axes, near: Axes, shown: Shown) -> None:
     """Shows four noise bounds around M* in the second panel, with the width that noise requires."""
     section, points, eps = shown.section, shown.critical.points, shown.sets.eps
     noise = section.noise(eps)

@@ -20,7 +20,7 @@ from hyrl_mj.viz.colours import BAD, INK, MODES, OBSERVED, OPEN, PALE, POLICY
 from hyrl_mj.viz.figures import charts, runs, style
 from hyrl_mj.viz.figures.charts import INNER, OUTER
 from hyrl_mj.viz.figures.runs import CORE, View
-from hyrl_mj.viz.figures.shown import ShownPolicy
+from hyrl_mj.viz.figures.shown import Shown
 from hyrl_mj.viz.section import Section
 
 # Cells along the longest side of a map of inputs.
@@ -39,7 +39,7 @@ ENDS = {
 }
 
 
-def draw_overview(shown: ShownPolicy) -> Figure:
+def draw_overview(shown: Shown) -> Figure:
     """Draws the ways that the policy goes without noise, and a run that noise leads astray."""
     task, arc = shown.task, shown.noisy
     charts.check_drawable(task)
@@ -55,7 +55,7 @@ def draw_overview(shown: ShownPolicy) -> Figure:
     return figure
 
 
-def _field(panel: Axes, shown: ShownPolicy) -> None:
+def _field(panel: Axes, shown: Shown) -> None:
     """Draws the overview of a plane."""
     section, partition, arc = shown.section, shown.partition, shown.noisy
     owners = _owners(partition)
@@ -75,7 +75,7 @@ def _field(panel: Axes, shown: ShownPolicy) -> None:
     _name_parts(panel, shown, owners)
 
 
-def _name_parts(panel: Axes, shown: ShownPolicy, owners: np.ndarray) -> None:
+def _name_parts(panel: Axes, shown: Shown, owners: np.ndarray) -> None:
     """Writes the name of each mode where its part, of `owners` (N,), has the most room in the plane."""
     section, partition, arc = shown.section, shown.partition, shown.noisy
     chart, nodes = section.chart, partition.grid.nodes
@@ -118,7 +118,7 @@ def _band(z: np.ndarray, eps: np.ndarray, longest: np.ndarray | float) -> np.nda
     return np.concatenate([boxes, *swept])
 
 
-def _spirals(panel: Axes, shown: ShownPolicy) -> None:
+def _spirals(panel: Axes, shown: Shown) -> None:
     """Draws the overview of a ring, time outward."""
     task, partition, arc = shown.task, shown.partition, shown.noisy
     seconds = task.scene.time
@@ -143,7 +143,7 @@ def _spirals(panel: Axes, shown: ShownPolicy) -> None:
             charts.words(panel, _part_label(task, mode), RIM * x, RIM * y)
 
 
-def _noiseless_runs(panel: Axes, shown: ShownPolicy, view: View) -> None:
+def _noiseless_runs(panel: Axes, shown: Shown, view: View) -> None:
     """Draws the runs without noise, with an arrowhead after a seventh of their samples."""
     looks = {"linewidth": 1.3, "zorder": 3}
     for arc in shown.noiseless:
@@ -157,7 +157,7 @@ def _noiseless_runs(panel: Axes, shown: ShownPolicy, view: View) -> None:
         panel.annotate("", points[1], points[0], arrowprops=arrow, zorder=3)
 
 
-def _noisy_run(panel: Axes, shown: ShownPolicy, view: View) -> None:
+def _noisy_run(panel: Axes, shown: Shown, view: View) -> None:
     """Draws the run under noise and what it measures."""
     task, arc = shown.task, shown.noisy
     looks = {"color": POLICY, "linewidth": 1.4, "zorder": 4}
@@ -198,7 +198,7 @@ def draw_arrivals(task: Task, starts: np.ndarray, outcomes: np.ndarray) -> Figur
 # ---- the map of the inputs
 
 
-def draw_policy_map(shown: ShownPolicy) -> Figure:
+def draw_policy_map(shown: Shown) -> Figure:
     """Draws a map of each input of the policy, and the policy's runs from the scene's starts."""
     task, section = shown.task, shown.section
     charts.check_drawable(task)
@@ -215,7 +215,7 @@ def draw_policy_map(shown: ShownPolicy) -> Figure:
     return figure
 
 
-def _paper_runs(panel: Axes, shown: ShownPolicy) -> None:
+def _paper_runs(panel: Axes, shown: Shown) -> None:
     """Draws the runs from the scene's starts."""
     task, first = shown.task, shown.paper[0]
     panel.set_title(style.noise_label(task, first.noise, first.bound).replace(", ", ",\n"))
@@ -228,7 +228,7 @@ def _paper_runs(panel: Axes, shown: ShownPolicy) -> None:
         charts.set_point_lines(panel, task)
 
 
-def _input_map(panel: Axes, shown: ShownPolicy, grid: Grid, inputs: np.ndarray, i: int) -> None:
+def _input_map(panel: Axes, shown: Shown, grid: Grid, inputs: np.ndarray, i: int) -> None:
     """Draws the map of an input, of those (N, m) at the nodes without noise, with its colour bar."""
     task, ring = shown.task, charts.is_ring(shown.task.chart)
     colours, scale, ticks = _input_colours(task, i)

@@ -15,7 +15,7 @@ from hyrl_mj.sets import Chart, Grid
 from hyrl_mj.viz import colours
 from hyrl_mj.viz.figures import charts, style
 from hyrl_mj.viz.figures.charts import INNER, OUTER, TICK
-from hyrl_mj.viz.figures.shown import ShownGame
+from hyrl_mj.viz.figures.shown import Shown
 from hyrl_mj.viz.tables import NAMES, percent
 
 # Of `MapClass`, in their order; colour-blind readers can tell them apart, too.
@@ -37,7 +37,7 @@ CURVES: dict[str, Looks] = {
 }  # fmt: skip
 
 
-def draw_robustness_map(shown: ShownGame) -> Figure:
+def draw_robustness_map(shown: Shown) -> Figure:
     """Draws a map for each controller: what becomes of runs from each state."""
     task, result, maps = shown.task, shown.result, shown.maps
     section = shown.section
@@ -79,7 +79,7 @@ def _panel_height(chart: Chart) -> float:
     return 1.1 + (float(3.2 * sides[1] / sides[0]) if len(sides) == 2 else 0.5)
 
 
-def _box(panel: Axes, shown: ShownGame, grid: Grid, classes: np.ndarray) -> None:
+def _box(panel: Axes, shown: Shown, grid: Grid, classes: np.ndarray) -> None:
     """Draws classes (N,) of nodes as an image over the chart; one coordinate is a strip of height 1."""
     section, chart = shown.section, shown.section.chart
     strip = chart.dimension == 1
@@ -101,7 +101,7 @@ def _box(panel: Axes, shown: ShownGame, grid: Grid, classes: np.ndarray) -> None
     charts.dots(panel, np.hstack([z, np.full_like(z, 0.5)]) if strip else z)
 
 
-def _ring(panel: Axes, shown: ShownGame, grid: Grid, classes: np.ndarray) -> None:
+def _ring(panel: Axes, shown: Shown, grid: Grid, classes: np.ndarray) -> None:
     """Draws classes (N,) of nodes as arcs of a ring."""
     task = shown.task
     charts.arcs(panel, task.chart, classes, CLASS_COLOURS, OUTER, INNER)
@@ -117,7 +117,7 @@ def _ring(panel: Axes, shown: ShownGame, grid: Grid, classes: np.ndarray) -> Non
 # ---- the curve
 
 
-def draw_robustness_curve(shown: ShownGame) -> Figure:
+def draw_robustness_curve(shown: Shown) -> Figure:
     """Draws what each controller wins against the noise bound.
 
     Where runs last for ever, a second panel shows the worst time to arrival.
@@ -198,7 +198,7 @@ def _dashed(name: str) -> Looks:
     }
 
 
-def _margins(panel: Axes, shown: ShownGame, unit: str) -> None:
+def _margins(panel: Axes, shown: Shown, unit: str) -> None:
     """Marks the margins above the curves, a row for each controller."""
     names = shown.result.controllers
     panel.set_ylim(-3, 105 + 5 * len(names))

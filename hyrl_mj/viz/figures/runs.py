@@ -17,7 +17,7 @@ from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks import ANY, Task, pattern_of
 from hyrl_mj.viz.colours import BAD, INK, PALE, POLICY, WHITE, mode_colour
 from hyrl_mj.viz.figures import charts, style
-from hyrl_mj.viz.figures.shown import ShownPolicy, ShownRun
+from hyrl_mj.viz.figures.shown import Shown
 from hyrl_mj.viz.section import Section
 from hyrl_mj.viz.tables import NAMED
 
@@ -111,7 +111,7 @@ def end(panel: Axes, task: Task, view: View, arc: HybridArc, beside: bool = Fals
 
 def chosen_way(
     panel: Axes,
-    shown: ShownPolicy,
+    shown: Shown,
     view: View,
     arc: HybridArc,
     same: str = "",
@@ -164,7 +164,7 @@ def hybrid_way(panel: Axes, task: Task, view: View, arc: HybridArc, modes: Seque
         mark(panel, view, arc, row, "D", color=INK, markersize=3.5, zorder=7, label="jump")
 
 
-def draw_runs(shown: ShownRun) -> Figure:
+def draw_runs(shown: Shown) -> Figure:
     """Draws the hybrid controller and the policy under the same noise, a column for each start mode.
 
     Of a chart with two coordinates the paths are shown in its plane, at most four beside each other; else

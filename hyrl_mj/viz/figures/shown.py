@@ -2,118 +2,99 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from functools import cached_property
 
+from hyrl_mj.errors import BadInput
 from hyrl_mj.judging.game import GameResult, Maps
 from hyrl_mj.policies import Policy
 from hyrl_mj.runs.arcs import overview_arcs, policy_start_arcs
 from hyrl_mj.runs.directory import Run
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.stages import CriticalSet, ExtendedSets, Partition
-from hyrl_mj.tasks import Task
 from hyrl_mj.viz.section import Section
 
 
-@dataclass(frozen=True)
-class ShownPolicy:
-    """What the figures of a stage-1 policy show.
+class Shown:
+    """What the figures of a run show, which is read, or simulated where no stage has saved it, when needed.
+
+    Args:
+        run: whose stages that a figure shows are finished.
+        noisy: a run of the policy under noise, from M* if there is one; by default the replay.
+        game, maps: the worst-case game and the class of every node; by default those of the run.
 
     Attributes:
+        task: the task, with all of its chart.
         section: of the chart that is drawn, of a chart of one or two dimensions all of it.
         algorithm: that trained the policy, "DQN".
-        policy: of stage 1, at its mean or mode where it is sampled.
-        critical: M* in the section.
-        partition: the parts M_i in the section.
-        noisy: a run under noise, from M* if there is one.
-        noiseless: runs from starts all along the start region.
-        paper: runs from the scene's starts of the policy, under the paper's noise.
+        policy_title: what legends call the policy: "RL policy (DQN)".
+        replays: arcs by start ("start0", ..., "critical") and controller ("policy", "hyrl_q0", ...), under
+            the same noise.
     """
 
-    section: Section
-    algorithm: str
-    policy: Policy
-    critical: CriticalSet
-    partition: Partition
-    noisy: HybridArc
-    noiseless: tuple[HybridArc, ...]
-    paper: tuple[HybridArc, ...]
+    def __init__(
+        self,
+        run: Run,
+        noisy: HybridArc | None = None,
+        game: GameResult | None = None,
+        maps: Maps | None = None,
+    ):
+        self._run, self.task, self.section = run, run.task, Section(run.task)
+        self.algorithm, self.policy_title = run.settings.stage1.title, run.policy_title
+        self._noisy, self._game, self._maps = noisy, game, maps
 
-    @property
-    def task(self) -> Task:
-        """The task, with all of its chart."""
-        return self.section.task
+    @cached_property
+    def policy(self) -> Policy:
+        """The policy of stage 1, at its mean or mode where it is sampled."""
+        return self._run.steady
 
-    @property
-    def policy_title(self) -> str:
-        """What legends call the policy: "RL policy (DQN)"."""
-        return f"RL policy ({self.algorithm})"
+    @cached_property
+    def critical(self) -> CriticalSet:
+        """M* in the section."""
+        return self.section.critical_set(self._run)
 
+    @cached_property
+    def partition(self) -> Partition:
+        """The parts M_i in the section."""
+        return self.section.partition(self._run.partition)
 
-@dataclass(frozen=True)
-class ShownRun(ShownPolicy):
-    """What the figures of a finished run show: its policy, and its hybrid controller.
+    @cached_property
+    def noisy(self) -> HybridArc:
+        """A run of the policy under noise, from M* if there is one."""
+        if self._noisy is not None:
+            return self._noisy
+        start = "critical" if ("critical", "policy") in self.replays else "start0"
+        return self.replays[start, "policy"]
 
-    Attributes:
-        sets: M_ext_i in the section.
-        replays: arcs by start ("start0", ..., "critical") and controller ("policy",
-            "hyrl_q0", ...), under the same noise.
-    """
+    @cached_property
+    def noiseless(self) -> list[HybridArc]:
+        """Runs of the policy from starts all along the start region."""
+        return overview_arcs(self.task, self.policy)
 
-    sets: ExtendedSets
-    replays: Mapping[tuple[str, str], HybridArc]
+    @cached_property
+    def paper(self) -> list[HybridArc]:
+        """Runs of the policy from the scene's starts, under the paper's noise."""
+        s = self._run.settings
+        return policy_start_arcs(self.task, self.policy, s.eps, s.seed)
 
+    @cached_property
+    def sets(self) -> ExtendedSets:
+        """The extended sets M_ext_i in the section."""
+        return self.section.extended_sets(self._run.extended_sets)
 
-@dataclass(frozen=True)
-class ShownGame:
-    """What the figures of the worst-case game show.
+    @cached_property
+    def replays(self) -> dict[tuple[str, str], HybridArc]:
+        return self._run.arcs()
 
-    Attributes:
-        section: of the chart that is drawn.
-        critical: M* in the section.
-        result: the scores, margins and curves.
-        maps: the class of every node in the section.
-    """
+    @cached_property
+    def result(self) -> GameResult:
+        """The scores, margins and curves of the worst-case game; raises `BadInput` if none is played."""
+        if (game := self._game or self._run.robustness.game) is None:
+            raise BadInput(
+                f"there is no map and no curve: no game is played, because {self._run.why_no_game}"
+            )
+        return game
 
-    section: Section
-    critical: CriticalSet
-    result: GameResult
-    maps: Maps
-
-    @property
-    def task(self) -> Task:
-        """The task, with all of its chart."""
-        return self.section.task
-
-
-def shown_policy(run: Run, noisy: HybridArc) -> ShownPolicy:
-    """Returns what the figures of a run's policy show; simulates the arcs that no stage has saved.
-
-    The run needs its critical set and partition. `noisy` is a run of the policy under noise, from M* if
-    there is one.
-    """
-    section, s = Section(run.task), run.settings
-    return ShownPolicy(
-        section,
-        s.stage1.title,
-        run.steady,
-        section.critical_set(run),
-        section.partition(run.partition),
-        noisy,
-        tuple(overview_arcs(run.task, run.steady)),
-        tuple(policy_start_arcs(run.task, run.steady, s.eps, s.seed)),
-    )
-
-
-def shown_game(run: Run, result: GameResult, maps: Maps) -> ShownGame:
-    """Returns what the figures of a run's game show."""
-    section = Section(run.task)
-    return ShownGame(section, section.critical_set(run), result, section.maps(maps))
-
-
-def shown_run(run: Run) -> ShownRun:
-    """Returns what the figures of a run show; its replays have been simulated."""
-    arcs, sets = run.arcs(), Section(run.task).extended_sets(run.extended_sets)
-    start = "critical" if ("critical", "policy") in arcs else "start0"
-    policy = shown_policy(run, arcs[start, "policy"])
-    return ShownRun(**vars(policy), sets=sets, replays=arcs)
+    @cached_property
+    def maps(self) -> Maps:
+        """The class of every node in the section."""
+        return self.section.maps(self._maps or self._run.maps)
