@@ -1,13 +1,6 @@
 """The command line: what people type, and what they are told when it is wrong."""
 
-import os
-import re
 import shutil
-import signal
-import socket
-import subprocess
-import sys
-import urllib.request
 from dataclasses import replace
 
 import numpy as np
@@ -147,45 +140,6 @@ def test_without_a_latest_simulation_there_is_nothing_to_replay(copied):
     assert_one_sentence(done, "latest_policy.npz is missing", "simulate it again")
 
 
-@needs_gl
-def test_a_video_that_cannot_be_written_leaves_nothing(copied):
-    (copied / "file").write_text("mine")
-    before = contents(copied)
-    done = call("replay", copied, "--out", copied / "file" / "replay.mp4", "--size", "640x320")
-    assert done.returncode in (1, 2)
-    assert "Traceback" not in done.stderr
-    assert str(copied / "file") in done.stderr
-    assert contents(copied) == before
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="a window would open")
-def test_the_web_viewer_is_for_this_machine_only(finished):
-    child = subprocess.Popen(
-        [sys.executable, "-m", "hyrl_mj.cli", "view", str(finished[0])],
-        env={**os.environ, "DISPLAY": "", "WAYLAND_DISPLAY": ""},  # with one a window would open
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        # Who runs in the background is deaf to Ctrl+C, and so would be its children.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
-    try:
-        said = child.stdout.readline()
-        address = re.search(r"http://127.0.0.1:(\d+)/", said)
-        assert address, said
-        with urllib.request.urlopen(address[0], timeout=20) as page:
-            assert "<html" in page.read().decode().lower()
-        # Who listens to the whole network is found at every address of this machine.
-        with pytest.raises(ConnectionRefusedError):
-            socket.create_connection(("127.0.0.2", int(address[1])), timeout=5)
-        child.send_signal(signal.SIGINT)
-        _, complaints = child.communicate(timeout=30)
-    finally:
-        child.kill()
-    assert child.returncode == 130
-    assert "Traceback" not in complaints
-
-
 def test_robustness_prints_the_worst_case_and_the_episodes(copied, monkeypatch):
     played_before(monkeypatch, hyrl_mj.load_run(copied))
     done = call("robustness", copied, "--episodes", "8", "--noise", "uniform,adversarial")
@@ -202,14 +156,6 @@ def test_robustness_prints_the_worst_case_and_the_episodes(copied, monkeypatch):
     assert [score.eps for score in robustness.game.scores["hyrl"]] == [0.0, 0.05, 0.1]
     kinds = {(c.noise, c.controller) for c in robustness.episodes}
     assert kinds == {(n, c) for n in ("uniform", "adversarial") for c in ("policy", "hyrl")}
-
-
-@pytest.mark.parametrize(("form", "out"), [("onnx", "circle.onnx"), ("numpy", "circle")])
-def test_export_writes_the_controller(form, out, finished, tmp_path):
-    done = call("export", finished[0], "--to", form, "--out", tmp_path / out)
-    assert done.returncode == 0, done.stderr
-    assert str(tmp_path / out) in done.stdout
-    assert (tmp_path / out).exists()
 
 
 def test_simulate_finds_the_worst_noise_and_prints_both_ends(copied):
@@ -333,11 +279,3 @@ print(arc.outcome)
     done = python(program)
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() in ("reached", "stalled")
-
-
-def test_a_policy_of_another_task_is_refused(copied):
-    policy = hyrl_mj.load_run(copied).policy
-    description = copied / "policy.json"
-    description.write_text(description.read_text().replace("unit_circle", "vehicle"))
-    assert_one_sentence(call("critical-set", copied), "policy.json was changed", "the stage train")
-    assert np.isfinite(policy.act(np.zeros((1, 1)))).all()

@@ -21,7 +21,7 @@ from figure_parts import (
     where,
     written,
 )  # fmt: skip
-from matplotlib.colors import to_hex, to_rgb
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.patches import Wedge
 from matplotlib.path import Path as Outline
@@ -204,12 +204,6 @@ def test_of_one_coordinate_that_is_not_periodic_only_the_runs_are_drawn():
     for name in ("overview", "policy", "extended_sets"):
         with pytest.raises(BadInput, match="one coordinate, a, which is not periodic"):
             draw(name, CIRCLE, task=Line())
-
-
-def test_tints_are_the_colours_with_white():
-    for tint, colour in ((style.mode_tint(i), colours.mode_colour(i)) for i in range(4)):
-        hue = np.subtract(1, to_rgb(tint)) / np.subtract(1, to_rgb(colour))
-        assert np.ptp(hue) < 0.1
 
 
 # ---- overview

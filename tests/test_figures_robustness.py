@@ -8,12 +8,10 @@ import matplotlib
 import numpy as np
 import pytest
 from figure_parts import EPS, size_of, where, written
-from matplotlib.figure import Figure
 from PIL import Image
 from scored import SPACING, score
 
 import hyrl_mj
-from hyrl_mj import BadInput
 from hyrl_mj.judging.game.result import (
     LIMIT,
     Curve,
@@ -173,7 +171,9 @@ def test_the_critical_set_lies_at_its_angle(tmp_path, coarse):
 
 def test_each_curve_has_its_colour(tmp_path, coarse):
     path = tmp_path / "curve.png"
-    draw_curve(VEHICLE, game_of(("policy", "hyrl")), path)
+    figure = draw_curve(VEHICLE, game_of(("policy", "hyrl")), path)
+    words = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert "margin of HyRL: 0.05 m" in words
     for colour in (*(looks["color"] for looks in robustness.CURVES.values()), colours.PALE):
         assert len(where(path, colour)) > 100
 
@@ -185,37 +185,6 @@ def test_times_are_drawn_where_runs_last_for_ever(tmp_path, coarse):
     assert size_of(two)[1] > size_of(one)[1] + 100
     assert size_of(two)[0] <= 800
     assert len(where(two, HYRL)) > len(where(one, HYRL))
-
-
-@pytest.mark.parametrize("task", [CIRCLE, VEHICLE], ids=lambda task: task.name)
-def test_without_a_path_the_figure_is_returned_and_nothing_is_written(tmp_path, monkeypatch, task):
-    monkeypatch.chdir(tmp_path)
-    names = ("policy", "hyrl")
-    maps = maps_of(task, names, lambda z: np.zeros(len(z)), cells=8)
-    critical = critical_of(task.scene.starts[2])
-    assert len(draw_map(task, game_of(names), maps, critical).axes) == len(names)
-    assert "margin of HyRL" in str(
-        [text.get_text() for text in draw_curve(task, game_of(names)).legends[0].get_texts()]
-    )
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("fails", ["on its way", "while it is written"])
-def test_nothing_is_left_behind_when_drawing_fails(tmp_path, monkeypatch, fails):
-    def half(self, content, **_):
-        content.write(b"\x89PNG")
-        raise OSError("no space left on device")
-
-    path, game = tmp_path / "curve.png", game_of(["hyrl"])
-    path.write_bytes(b"an older picture")
-    if fails == "on its way":
-        del game.curve.wins["hyrl"]
-    else:
-        monkeypatch.setattr(Figure, "savefig", half)
-    with pytest.raises((BadInput, KeyError)):
-        draw_curve(VEHICLE, game, path)
-    assert path.read_bytes() == b"an older picture"
-    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_the_users_own_style_is_neither_used_nor_changed(tmp_path, coarse):

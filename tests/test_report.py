@@ -281,30 +281,6 @@ def test_the_scores_are_those_of_the_game(problem, copied, planted_circle, tmp_p
         assert off == pytest.approx(game.miss_without_noise[who], abs=1e-3)
 
 
-def test_episodes_and_replays_are_those_of_the_run(finished):
-    page, run = page_of(finished), load_run(finished)
-    for row, record in zip(page.table("noisy episodes"), run.robustness.episodes, strict=True):
-        assert row["episodes"] == f"{record.episodes:,}"
-        assert row["noise"].startswith("uniform 0.1 ")
-        reached = 100 if row["reached"] == "all tried" else float(row["reached"].strip("<>%"))
-        assert reached == pytest.approx(100 * record.reached, abs=0.0101)
-    rows = page.table("alternating noise")
-    assert len(rows) == 6
-    for row, (_, arcs) in zip(rows, by_start(run).items(), strict=True):
-        assert len(row) == 1 + len(arcs) == 4
-        for cell, arc in zip(list(row.values())[1:], arcs, strict=True):
-            assert cell.split()[0] == arc.outcome.split("_")[0]
-            assert f"{arc.t[-1]:.2f} s" in cell
-            assert f"{arc.j[-1]} jump" in cell
-
-
-def by_start(run):
-    found = {}
-    for (start, _), arc in run.arcs().items():
-        found.setdefault(start, []).append(arc)
-    return found
-
-
 def test_settings_versions_and_the_command_are_told(finished):
     page, run = page_of(finished), load_run(finished)
     config = json.loads((finished / "config.json").read_text())

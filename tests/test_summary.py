@@ -81,12 +81,6 @@ def test_scores_are_a_row_for_each_bound_and_controller(run):
     assert "excursion [rad]" in table.headings, "a run on the circle goes on for ever"
 
 
-def test_margins_are_a_row_for_each_controller(run):
-    table = margin_table(run.task, run.robustness.game)
-    assert {row[0] for row in table.rows} <= {"RL policy", "HyRL", "limit"}
-    assert all(row[1] == "none" or row[1].endswith(" rad") for row in table.rows)
-
-
 def test_episodes_are_counted_by_noise_controller_and_region(examined):
     table = episode_table(examined.task, examined.robustness.episodes)
     assert {row[0] for row in table.rows} == {"uniform 0.1 rad"}
