@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 import signal
 import subprocess
 import sys
@@ -19,22 +20,6 @@ from hyrl_mj.physics import memory
 from hyrl_mj.physics.rendering import GL_CURE
 from hyrl_mj.viz.encoding import video
 
-# Distributions whose versions matter. Read from their metadata: importing torch takes seconds.
-DISTRIBUTIONS = (
-    "hyrl-mj",
-    "mujoco",
-    "gymnasium",
-    "stable-baselines3",
-    "torch",
-    "numpy",
-    "scipy",
-    "safetensors",
-    "mediapy",
-    "imageio-ffmpeg",
-    "pillow",
-    "matplotlib",
-    "jinja2",
-)
 RENDER_TIMEOUT = 60.0  # [s]
 
 # Draws for half a second; prints the name of the GL device and its frames per second.
@@ -84,9 +69,13 @@ def report() -> tuple[list[str], bool]:
 
 
 def versions() -> tuple[list[str], list[str]]:
-    """Returns a line per distribution with its version, and the names of those that are missing."""
+    """Returns a line per distribution with its version, and the names of those that are missing.
+
+    These are this one and those that it needs, by their metadata: importing torch takes seconds.
+    """
     lines, missing = [f"python             {platform.python_version()}"], []
-    for name in DISTRIBUTIONS:
+    needed = [n for n in metadata.requires("hyrl-mj") or () if "extra ==" not in n]
+    for name in ("hyrl-mj", *(re.split(r"[^\w-]", n)[0] for n in needed)):
         try:
             version = metadata.version(name)
         except metadata.PackageNotFoundError:

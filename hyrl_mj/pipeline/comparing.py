@@ -9,7 +9,7 @@ from functools import partial
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 from uuid import uuid4
 
 import numpy as np
@@ -19,18 +19,19 @@ from hyrl_mj.files.manifest import locked
 from hyrl_mj.files.sources import digest_of
 from hyrl_mj.judging import Budget, ExamineOptions, attack, examine
 from hyrl_mj.judging.game import Game, Robustness, curve_grid, percent
-from hyrl_mj.learning import setting_value
 from hyrl_mj.pipeline.runs import (
     RunOptions,
     checked_seeds,
     complete,
     run,
+    setting_values,
     settings_of,
     several,
     usable_task,
 )
 from hyrl_mj.pipeline.steps import subject_of
 from hyrl_mj.policies import Controller, as_controller, is_memory, memory_at_start
+from hyrl_mj.ranges import By, Checked
 from hyrl_mj.runs import compared
 from hyrl_mj.runs.compared import Compared, Row
 from hyrl_mj.runs.directory import Run
@@ -46,7 +47,7 @@ EPISODES = 1_000
 
 
 @dataclass(frozen=True)
-class CompareOptions:
+class CompareOptions(Checked):
     """The options of a comparison.
 
     Attributes:
@@ -61,17 +62,11 @@ class CompareOptions:
     """
 
     eps: float | None = None
-    seeds: tuple[int, ...] = (0,)
+    seeds: Annotated[tuple[int, ...], By(checked_seeds)] = (0,)
     preset: str = "fast"
-    set: dict[str, Any] = field(default_factory=dict)
-    only: tuple[str, ...] = ()
+    set: Annotated[dict[str, Any], By(setting_values)] = field(default_factory=dict)
+    only: Annotated[tuple[str, ...], By(several)] = ()
     out: str | Path | None = None
-
-    def __post_init__(self) -> None:
-        changed = {name: setting_value(value) for name, value in self.set.items()}
-        values = {"seeds": checked_seeds(self.seeds), "only": several(self.only), "set": changed}
-        for name, value in values.items():
-            object.__setattr__(self, name, value)  # the dataclass is frozen
 
 
 def compare(

@@ -14,11 +14,11 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
-from hyrl_mj.errors import BadInput, HyrlError, check_seed, counted, unknown
+from hyrl_mj.errors import BadInput, HyrlError, check_bound, check_seed, counted, unknown
 from hyrl_mj.files.manifest import locked
 from hyrl_mj.judging import Arrivals, Failures
 from hyrl_mj.judging.game import LATTICE
-from hyrl_mj.learning import Settings, Training, changed, preset
+from hyrl_mj.learning import Settings, Training, changed, preset, setting_value
 from hyrl_mj.pipeline.steps import DIAGNOSIS, STAGES, extended_sets_stage, run_stage
 from hyrl_mj.policies import ALGORITHMS, FUNCTION, AnyPolicy, algorithms, read_agent
 from hyrl_mj.runs import directory
@@ -157,6 +157,16 @@ def checked_seeds(seeds: Any) -> tuple[int, ...]:
     if twice := [seed for seed, count in Counter(checked).items() if count > 1]:
         raise BadInput(f"the seed {twice[0]} is given twice: give each seed once")
     return checked
+
+
+def checked_bounds(bounds: Any) -> tuple[float, ...]:
+    """Returns noise bounds, or a single one, as a tuple; raises `BadInput` for one that cannot be used."""
+    return tuple(map(check_bound, several(bounds)))
+
+
+def setting_values(changes: dict[str, Any]) -> dict[str, Any]:
+    """Returns the settings to change by name, with the values of those that are texts."""
+    return {name: setting_value(value) for name, value in changes.items()}
 
 
 def run(

@@ -7,23 +7,24 @@ from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from hyrl_mj.errors import BadInput, check_bound
+from hyrl_mj.errors import BadInput
 from hyrl_mj.files.manifest import locked
-from hyrl_mj.learning import setting_value
 from hyrl_mj.pipeline import cluster
 from hyrl_mj.pipeline.board import Board
 from hyrl_mj.pipeline.runs import (
     BOUND,
     RunOptions,
+    checked_bounds,
     checked_seeds,
     complete,
+    setting_values,
     settings_of,
     several,
     usable_task,
 )
-from hyrl_mj.ranges import Integer, Number
+from hyrl_mj.ranges import By, Checked, Integer, Number, Optional
 from hyrl_mj.runs import sweeps
 from hyrl_mj.runs.sweeps import Common, Row, Setting, Sweep
 from hyrl_mj.system.progress import Say
@@ -31,7 +32,7 @@ from hyrl_mj.tasks import reference
 
 
 @dataclass(frozen=True)
-class SweepOptions:
+class SweepOptions(Checked):
     """The options of a sweep: a run is made for each combination of algorithm, noise bound and seed.
 
     Attributes:
@@ -51,15 +52,15 @@ class SweepOptions:
         out: the folder of the sweep.
     """
 
-    seeds: tuple[int, ...] = (0,)
-    eps: tuple[float, ...] | None = None
-    algorithm: tuple[str, ...] = ()
+    seeds: Annotated[tuple[int, ...], By(checked_seeds)] = (0,)
+    eps: Annotated[tuple[float, ...] | None, Optional(By(checked_bounds))] = None
+    algorithm: Annotated[tuple[str, ...], By(several)] = ()
     preset: str = "fast"
     horizon: float | None = None
     all_coordinates: bool = False
-    set: dict[str, Any] = field(default_factory=dict)
-    cores: int | None = None
-    memory: float = 1.5
+    set: Annotated[dict[str, Any], By(setting_values)] = field(default_factory=dict)
+    cores: Annotated[int | None, Optional(Integer(1, 1_024))] = None
+    memory: Annotated[float, Number(0, 10_000, above=True)] = 1.5
     address: str | None = None
     out: str | Path = Path("runs/sweep")
 
@@ -67,16 +68,6 @@ class SweepOptions:
     def bounds(self) -> tuple[float, ...]:
         """The bounds of the noise."""
         return (BOUND,) if self.eps is None else self.eps
-
-    def __post_init__(self) -> None:
-        values = {
-            "seeds": checked_seeds(self.seeds),
-            "eps": None if self.eps is None else tuple(map(check_bound, several(self.eps))),
-            "algorithm": several(self.algorithm),
-            "set": {name: setting_value(value) for name, value in self.set.items()},
-        }
-        for name, value in values.items():
-            object.__setattr__(self, name, value)  # the dataclass is frozen
 
 
 def sweep(
@@ -160,7 +151,9 @@ def write(result: Sweep, folder: Path) -> None:
 
 def _jobs(names: tuple[str | Path, ...], options: SweepOptions) -> Iterator[tuple[Row, RunOptions]]:
     """Yields an open row and the options of each run; every value is checked before anything is made."""
-    _check(names, options)
+    for what, values in (("task", names), ("seed", options.seeds), ("eps", options.bounds)):
+        if not values:
+            raise BadInput(f"a sweep needs at least one {what}: give one or more")
     seen: set[str] = set()
     for name in names:
         task = usable_task(name)
@@ -194,16 +187,6 @@ def _jobs(names: tuple[str | Path, ...], options: SweepOptions) -> Iterator[tupl
             for seed in options.seeds:
                 row = Row(setting, seed)
                 yield row, replace(one, seed=seed, out=Path(options.out).resolve() / row.name)
-
-
-def _check(names: tuple[str | Path, ...], options: SweepOptions) -> None:
-    """Raises `BadInput` if there is nothing to do, or a share is out of range."""
-    for what, values in (("task", names), ("seed", options.seeds), ("eps", options.bounds)):
-        if not values:
-            raise BadInput(f"a sweep needs at least one {what}: give one or more")
-    if options.cores is not None:
-        Integer(1, 1_024).checked("cores", options.cores)
-    Number(0, 10_000, above=True).checked("memory", options.memory)
 
 
 def _seen(row: Row, folder: Path, common: Common) -> Row:
