@@ -234,7 +234,7 @@ def simulate(
     def work(run: Run) -> None:
         arcs = noisy_arcs(run, z0, noise, eps, (q0,), time, seed)
         for name, (arc,) in zip(("policy", "hyrl"), arcs.values(), strict=True):
-            arc.save(run.latest_path(name))
+            arc.save(run.arc_path("latest", name))
             end = run.task.chart.format(arc.z[-1])
             print(f"{name:7} {arc.outcome:14} t = {arc.t[-1]:.2f} s, {arc.j[-1]} jumps, {end}")
 

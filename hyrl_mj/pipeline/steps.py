@@ -229,7 +229,7 @@ def examine_stage(run: Run, say: Say, options: ExamineOptions = USUAL) -> None:
     options.budget(subject.effort, subject.exact)  # a wrong one is refused before the work
     found = examine(subject, options, attacked=True)
     for name, arc in found.arcs.items():
-        arc.save(run.attack_path(name))
+        arc.save(run.arc_path("attack", name))
     if found.maps is not None:
         draw_robustness(run, found, run.path / "figures")
         found.maps.save(run.path / "robustness.npz")

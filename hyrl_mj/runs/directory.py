@@ -309,7 +309,15 @@ class Run:
         starts = [f"start{i}" for i in range(len(self.task.scene.starts))]
         starts += ["critical"] if len(self.critical_set.points) else []
         loops = ["policy"] + [f"hyrl_q{q}" for q in self.extended_sets.modes]
-        return {(s, c): self.path / "arcs" / f"{s}_{c}.npz" for s in starts for c in loops}
+        return {(s, c): self.arc_path(s, c) for s in starts for c in loops}
+
+    def arc_path(self, start: str, controller: str) -> Path:
+        """Returns the file of an arc, as of `arc_paths`.
+
+        The start may also be "attack", of the strongest signal that was found, or "latest", of the user's own
+        simulation; then the controllers are "policy" and "hyrl".
+        """
+        return self.path / "arcs" / f"{start}_{controller}.npz"
 
     def arcs(self) -> dict[tuple[str, str], HybridArc]:
         """Returns the replays by start and controller, as `arc_paths`."""
@@ -340,13 +348,9 @@ class Run:
             )
         return arc
 
-    def attack_path(self, controller: str) -> Path:
-        """Returns the file of the strongest signal of the attack on "policy" or "hyrl"."""
-        return self.path / "arcs" / f"attack_{controller}.npz"
-
     def attack_arcs(self) -> dict[str, HybridArc]:
         """Returns the strongest signals of the attack by controller, {} if there was none."""
-        paths = {name: self.attack_path(name) for name in ("policy", "hyrl")}
+        paths = {name: self.arc_path("attack", name) for name in ("policy", "hyrl")}
         has = [self.manifest.has(path) for path in paths.values()]
         return {name: self.arc(path) for name, path in paths.items()} if all(has) else {}
 
@@ -378,10 +382,6 @@ class Run:
         maps = self.maps
         z = maps.grid(self.task.chart).nodes
         return z[(maps.map[controller] == MapClass.BEATEN) & self.task.may_start(z)]
-
-    def latest_path(self, controller: str) -> Path:
-        """Returns the file of the latest simulation from the user's own start."""
-        return self.path / "arcs" / f"latest_{controller}.npz"
 
     def _checked(self, name: str) -> Path:
         """Returns the path of a file, if it is to be believed."""

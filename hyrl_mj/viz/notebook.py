@@ -177,7 +177,6 @@ class Run(directory.Run):
         from hyrl_mj.viz.replay import check_replay, render_replay
         from hyrl_mj.viz.shows import replay_floor, replay_shows
 
-        size = tuple(size) if isinstance(size, list) else size
         options = ReplayOptions(layout, camera, size, fps, slow_motion)
         check_replay(self.task, Path("replay.mp4"), options)
         shows = replay_shows(self, starts, noise, eps)

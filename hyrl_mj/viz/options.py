@@ -3,10 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from numbers import Integral
+from typing import Annotated
+
+from hyrl_mj.errors import BadInput
+from hyrl_mj.ranges import By, Checked, Integer, Number, OneOf
+
+
+def _size(size: object) -> tuple[int, int]:
+    """Returns width and height, if they are two integers."""
+    match size:
+        case (Integral() as width, Integral() as height):
+            return int(width), int(height)
+    raise BadInput(f"size {size!r} cannot be used: give width and height [pixels]")
 
 
 @dataclass(frozen=True)
-class ReplayOptions:
+class ReplayOptions(Checked):
     """How a replay is rendered.
 
     Attributes:
@@ -17,11 +30,11 @@ class ReplayOptions:
         slow_motion: how many times slower the video is around jumps.
     """
 
-    layout: str = "side-by-side"
+    layout: Annotated[str, OneOf(("side-by-side", "overlay"))] = "side-by-side"
     camera: str | None = None
-    size: tuple[int, int] = (1280, 720)
-    fps: int = 30
-    slow_motion: float = 1.0
+    size: Annotated[tuple[int, int], By(_size)] = (1280, 720)
+    fps: Annotated[int, Integer(1, 240)] = 30
+    slow_motion: Annotated[float, Number(1, 100)] = 1.0
 
     def lasting(self, seconds: float) -> ReplayOptions:
         """Returns these options with at most 600 frames in so many seconds [s], but at least 10 a second."""

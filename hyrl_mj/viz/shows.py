@@ -44,7 +44,7 @@ def replay_shows(
             raise BadInput(
                 "the latest simulation has its noise: give noise and eps to hyrl-mj simulate, not here"
             )
-        policy, hybrid = ([run.arc(run.latest_path(who))] for who in ("policy", "hyrl"))
+        policy, hybrid = ([run.arc(run.arc_path("latest", who))] for who in ("policy", "hyrl"))
         return [Show(policy, hybrid, run.policy_title, modes)]
     if starts == "critical" and not is_new and (attacked := attack_replay(run)):
         return [Show([attacked["policy"]], [attacked["hyrl"]], run.policy_title, modes)]

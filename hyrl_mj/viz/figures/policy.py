@@ -123,7 +123,8 @@ def _spirals(panel: Axes, shown: Shown) -> None:
     task, partition, arc = shown.task, shown.partition, shown.noisy
     seconds = task.scene.time
     tints = [style.mode_tint(i) for i in range(len(partition.modes))]
-    charts.arcs(panel, task.chart, _owners(partition), [*tints, None], OUTER, CORE)
+    owners = _owners(partition)
+    charts.arcs(panel, task.chart, owners, [*tints, None], OUTER, CORE)
     charts.ring(panel, task.chart, (OUTER, CORE), f",\ntime outward:\n0 to {seconds:g} s")
     view = runs.spiral_view(task.chart, seconds)
     _noiseless_runs(panel, shown, view)
@@ -134,7 +135,6 @@ def _spirals(panel: Axes, shown: Shown) -> None:
     if task.set_point is not None:
         charts.cross(panel, *np.ravel(charts.on_ring(task.chart, task.set_point)))
     charts.spokes(panel, task.chart, shown.critical.points, CORE - 0.06)
-    owners = _owners(partition)
     for i, mode in enumerate(partition.modes):
         # Where it is farthest to the other parts.
         if (own := owners == i).any():
