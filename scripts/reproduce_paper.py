@@ -212,7 +212,7 @@ def main() -> None:
     parser.add_argument("--vehicle", type=Path, default=Path("runs/vehicle"), metavar="RUN")
     parser.add_argument("--out", type=Path, default=Path("runs/paper"), metavar="DIR")
     options = parser.parse_args()
-    progress.enabled = sys.stderr.isatty()
+    progress.shown = "bars" if sys.stderr.isatty() else "lines"
     circle = opened(options.circle, "unit_circle")
     vehicle = opened(options.vehicle, "vehicle")
     draw(circle, vehicle, options.out)

@@ -30,9 +30,6 @@ from hyrl_mj.simulation import (
 )
 from hyrl_mj.tasks import Task
 
-# From so many points of M* it is tried whether the policy is lost.
-ON_CRITICAL = 16
-
 
 def from_middle(task: Task, z: np.ndarray) -> np.ndarray:
     """Returns the distances (n,) of chart points (n, d) from the middle of the replay starts."""
@@ -41,9 +38,9 @@ def from_middle(task: Task, z: np.ndarray) -> np.ndarray:
 
 
 def critical_starts(run: Run) -> np.ndarray:
-    """Returns the points (n, d) of M* that are nearest to the replay starts, the nearest first."""
+    """Returns the 16 points (n, d) of M* that are nearest to the replay starts, the nearest first."""
     points = run.critical_set.points
-    return points[np.argsort(from_middle(run.task, points), kind="stable")[:ON_CRITICAL]]
+    return points[np.argsort(from_middle(run.task, points), kind="stable")[:16]]
 
 
 def noisy_arcs(

@@ -21,11 +21,6 @@ from hyrl_mj.viz.shows import replay_floor
 # In the run directory: the page, and the folder with its pictures and data.
 PAGE, FOLDER = "diagnosis.html", "diagnosis"
 REPLAY = ReplayOptions(size=(960, 720))  # of the policy alone
-NO_SPLIT = (
-    "Without a critical set there is nothing to split: to robustify this policy is to train one policy under "
-    "noise."
-)
-GOES_ON = "The same run directory then gets a policy for each way, joined with hysteresis:"
 
 
 def write_worst(run: Run, arc: HybridArc | None, say: Callable[[str], None]) -> None:
@@ -55,7 +50,12 @@ def write_page(run: Run, robustness: Robustness, arc: HybridArc | None, results:
     task, folder, agent = run.task, run.path / FOLDER, run.agent
     parts: list[pages.Part] = [[f"{capital(result)}." for result in results]]
     if not len(run.critical_set.points):
-        parts.append(pages.paragraph(NO_SPLIT))
+        parts.append(
+            pages.paragraph(
+                "Without a critical set there is nothing to split: to robustify this policy is to train one "
+                "policy under noise."
+            )
+        )
     if arc is not None:
         caption = (
             f"The policy from {task.chart.format(arc.z[0])} under {arc.noise} noise, in real time. The "
@@ -64,6 +64,7 @@ def write_page(run: Run, robustness: Robustness, arc: HybridArc | None, results:
         name = f"Replay of the policy under {arc.noise} noise"
         parts.append(pages.film(folder / "worst.mp4", name, caption) or NO_VIDEO)
     figures = pages.pictures(folder)
+    goes_on = "The same run directory then gets a policy for each way, joined with hysteresis:"
     sections: list[pages.Section] = [
         ("Results", parts),
         (
@@ -71,7 +72,7 @@ def write_page(run: Run, robustness: Robustness, arc: HybridArc | None, results:
             figures or [pages.missing("A chart of this kind cannot be drawn in the plane.")],
         ),
         ("Tables", against_noise(run, robustness)),
-        ("How to go on", [pages.paragraph(GOES_ON), pages.code(beginning(run, run.path))]),
+        ("How to go on", [pages.paragraph(goes_on), pages.code(beginning(run, run.path))]),
     ]
     title, name = task_title(task), pages.name_of(run.path)
     text = pages.fill(

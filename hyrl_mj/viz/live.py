@@ -29,8 +29,6 @@ from hyrl_mj.viz.viewing import FPS, PAUSE, served, show
 CONTROLLERS = {"HyRL": "hyrl", "the policy alone": "policy"}
 SELECTED = "selected by the first measurement"
 PLACES = 60  # cells along the longer side of the plane of places that the start is dragged to
-ABOVE = (0.0, 0.0, 0.2)  # of the robot stands the name of the mode [m]
-TELLS = 10  # times in a second that the page tells where the robot is
 
 
 def live(run: Run, port: int = 0, say: Say = print) -> None:
@@ -129,8 +127,10 @@ class Page:
         if self._ghost.visible:
             self._ghost.position = marks.tracked_points(task, measured[None])[0]
         mode = task.mode_name(int(arc.q[row])) if track.modes else "the policy alone"
-        self._label.text, self._label.position = mode, np.add(track.point(t), ABOVE)
-        if abs(self.t - self._told) >= 1 / TELLS or not self.playing.value:
+        above = (0.0, 0.0, 0.2)  # the robot [m]
+        self._label.text, self._label.position = mode, np.add(track.point(t), above)
+        # Ten times in a second: more often nobody reads it.
+        if abs(self.t - self._told) >= 0.1 or not self.playing.value:
             self._told = self.t
             self.told.content = (
                 f"**{arc.ending(task).replace('_', ' ')}** after {arc.t[-1]:.2f} s, jumps: {arc.j[-1]}\n\n"

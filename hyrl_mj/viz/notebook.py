@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
-CONTROLLERS = ("policy", "hyrl")
 # What `dir` lists: the rest is for the stages.
 ATTRIBUTES = (
     "path", "settings", "versions", "task", "agent", "policy", "controller", "controllers", "critical_set",
@@ -141,8 +140,8 @@ class Run(directory.Run):
 
         starts = self.task.chart.check(z0, self.task.name)
         found = noisy_arcs(self, starts, noise, eps, (q0,), horizon, seed).values()
-        one = np.ndim(z0) < 2
-        return {who: arcs[0] if one else arcs for who, arcs in zip(CONTROLLERS, found, strict=True)}
+        runs = zip(("policy", "hyrl"), found, strict=True)
+        return {who: arcs[0] if np.ndim(z0) < 2 else arcs for who, arcs in runs}
 
     def replay(
         self,

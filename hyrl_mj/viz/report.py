@@ -21,7 +21,6 @@ from hyrl_mj.viz.commands import changed, commands
 from hyrl_mj.viz.figures import CLASS_COLOURS
 from hyrl_mj.viz.figures.style import task_title
 
-FILM = "Replay of the policy and HyRL, side by side"
 NO_VIDEO = pages.missing(
     "There is no video of the replay, for which an off-screen renderer and ffmpeg are needed. What this "
     "machine lacks tells",
@@ -76,7 +75,13 @@ def render(run: Run) -> str:
         listed=listed,
         worst=robustness
         and "worst noise of up to " + task.noise_text(robustness.eps, robustness.everywhere),
-        film=pages.film(run.path / "replay.mp4", FILM, _film_caption(run), has) or NO_VIDEO,
+        film=pages.film(
+            run.path / "replay.mp4",
+            "Replay of the policy and HyRL, side by side",
+            _film_caption(run),
+            has,
+        )
+        or NO_VIDEO,
         pictures=pages.pictures(run.path / "figures", has),
         arrivals={who: tables.arrivals(run, arcs, who == "policy") for who in ("policy", "hyrl")}
         if arcs

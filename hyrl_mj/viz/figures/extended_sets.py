@@ -17,7 +17,6 @@ from hyrl_mj.viz.figures.charts import OUTER
 from hyrl_mj.viz.figures.shown import Shown
 from hyrl_mj.viz.tables import NAMED
 
-LETTERS = 40  # of a line above a panel of two
 CORE, GAP = 0.6, 0.05  # the inner radius of the innermost ring, and the gap between rings
 
 
@@ -71,7 +70,8 @@ def _draw_each(shown: Shown, shared: np.ndarray, title: str) -> Figure:
             charts.dots(panel, shown.critical.points)
             mode = sets.modes[i]
             name = f"{style.set_label(mode, extended=True)}, of mode {shown.task.mode_name(mode)}"
-            panel.set_title(fill(name, LETTERS), color=mode_colour(i), fontweight="bold")
+            title = fill(name, 40)  # letters of a line above a panel of two
+            panel.set_title(title, color=mode_colour(i), fontweight="bold")
         for panel in panels[len(sets.sets) :]:
             panel.set_axis_off()
         style.legend(figure)

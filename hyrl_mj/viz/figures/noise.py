@@ -14,21 +14,21 @@ from hyrl_mj.system.picture import Picture
 from hyrl_mj.viz import colours
 from hyrl_mj.viz.figures.style import DPI, STYLE, WIDTH, grid_lines
 
-MOST = 8  # rows: more cannot be read
-# Letters of 13 points on 7.8 inches can be read where the figure is 400 pixels wide.
-SIZES = {"font.size": 13, "axes.titlesize": 13, "legend.fontsize": 12}
-
 
 def draw_noise(noise: LogNoise, path: Path) -> None:
-    """Draws the errors of each column of a log, in its unit, and writes a PNG; the first 8 columns.
+    """Draws the errors of each column of a log, in its unit, and writes a PNG.
+
+    These are the first 8 columns: more cannot be read.
 
     Raises:
         BadInput: the path does not end in .png.
     """
     if path.suffix != ".png":
         raise BadInput(f"--out {path} cannot be written: give a name that ends in .png")
-    columns = [column for column in noise.columns if len(column.errors)][:MOST]
-    with styles.context(["default", STYLE, SIZES]):
+    columns = [column for column in noise.columns if len(column.errors)][:8]
+    # Letters of 13 points on 7.8 inches can be read where the figure is 400 pixels wide.
+    sizes = {"font.size": 13, "axes.titlesize": 13, "legend.fontsize": 12}
+    with styles.context(["default", STYLE, sizes]):
         figure = Picture(figsize=(WIDTH, 0.6 + 4.6 * len(columns)), layout="constrained")
         parts = figure.subfigures(len(columns), 1, squeeze=False).ravel()
         for part, c in zip(parts, columns, strict=True):

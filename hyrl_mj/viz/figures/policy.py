@@ -23,12 +23,8 @@ from hyrl_mj.viz.figures.runs import CORE, View
 from hyrl_mj.viz.figures.shown import Shown
 from hyrl_mj.viz.section import Section
 
-# Cells along the longest side of a map of inputs.
-MAP = 240
 # Words are about three times as wide as high: how far off they keep from what is drawn, along x and y.
 LABEL = np.array([3.0, 1.0])
-RIM = 0.88  # the radius of words on a ring, outside most runs
-NOISELESS = "policy without noise, in the colour of the mode it follows"
 ENDS = {
     Outcome.RUNNING: OPEN,
     Outcome.REACHED: PALE,
@@ -139,15 +135,16 @@ def _spirals(panel: Axes, shown: Shown) -> None:
         # Where it is farthest to the other parts.
         if (own := owners == i).any():
             at = partition.grid.nodes[GridSet.from_mask(partition.grid, own).values.argmin()]
-            x, y = np.ravel(charts.on_ring(task.chart, at))
-            charts.words(panel, _part_label(task, mode), RIM * x, RIM * y)
+            x, y = 0.88 * np.ravel(charts.on_ring(task.chart, at))  # outside most runs
+            charts.words(panel, _part_label(task, mode), x, y)
 
 
 def _noiseless_runs(panel: Axes, shown: Shown, view: View) -> None:
     """Draws the runs without noise, with an arrowhead after a seventh of their samples."""
     looks = {"linewidth": 1.3, "zorder": 3}
+    label = "policy without noise, in the colour of the mode it follows"
     for arc in shown.noiseless:
-        drawn = runs.chosen_way(panel, shown, view, arc, NOISELESS, **looks)
+        drawn = runs.chosen_way(panel, shown, view, arc, label, **looks)
         row = len(arc.t) // 7
         points = view.points(arc.t[row : row + 2], arc.z[row : row + 2])
         if len(points) < 2 or (np.abs(points[1] - points[0]) > view.longest).any():
@@ -202,11 +199,11 @@ def draw_policy_map(shown: Shown) -> Figure:
     """Draws a map of each input of the policy, and the policy's runs from the scene's starts."""
     task, section = shown.task, shown.section
     charts.check_drawable(task)
-    chart = section.chart
+    chart, cells = section.chart, 240  # along the longest side of a map
     with style.drawing(5.2, section, f"the {shown.algorithm} policy") as figure:
         *maps, panel = figure.subplots(1, len(task.inputs) + 1)
         ring = charts.is_ring(chart)
-        grid = Grid(chart, (720,)) if ring else Grid.with_cells(chart, MAP)
+        grid = Grid(chart, (720,)) if ring else Grid.with_cells(chart, cells)
         inputs = shown.policy.act(task.at(section.lift(grid.nodes)))
         for i, input_panel in enumerate(maps):
             _input_map(input_panel, shown, grid, inputs, i)

@@ -24,8 +24,7 @@ from hyrl_mj.viz.tables import NAMED
 CORE = 0.4  # the radius at which spirals begin; they end at 1
 # How far beside a panel marks are drawn, in parts of it: that of an end just out of bounds is, but not one of
 # a robot that was thrown far off, whose path is cut at the edge.
-EDGE = 0.05
-SHOWN = Bbox.from_extents(-EDGE, -EDGE, 1 + EDGE, 1 + EDGE)
+SHOWN = Bbox.unit().padded(0.05)
 
 
 @dataclass(frozen=True)
