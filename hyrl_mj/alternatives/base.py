@@ -114,6 +114,17 @@ class Given:
 TRIED = 256
 
 
+@dataclass(frozen=True)
+class Remembering:
+    """A policy with a memory before that of stage 1; without its memory it answers as that does."""
+
+    task: Task
+    policy: Policy
+
+    def act(self, measured: np.ndarray) -> np.ndarray:
+        return self.policy.act(measured)
+
+
 class Alternative(ABC):
     """What people would do instead.
 

@@ -8,27 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from hyrl_mj.alternatives.base import Alternative, Candidate, Given, register
-from hyrl_mj.policies import Policy
-from hyrl_mj.tasks import Task
+from hyrl_mj.alternatives.base import Alternative, Candidate, Given, Remembering, register
 
 
 @dataclass(frozen=True)
-class MovingAverage:
+class MovingAverage(Remembering):
     """A policy that acts on the mean of the last chart points.
 
     The memory of a run is how many of them it has, and these, the latest last.
     """
 
-    task: Task
-    policy: Policy
     length: int
 
     def start(self, n: int) -> np.ndarray:
         return np.zeros((n, 1 + (self.length - 1) * self.task.chart.dimension))
-
-    def act(self, measured: np.ndarray) -> np.ndarray:
-        return self.policy.act(measured)
 
     def act_after(self, memory: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         task, n = self.task, len(measured)
@@ -45,8 +38,9 @@ class MovingAverage:
 
 
 @dataclass(frozen=True)
-class KalmanFilter:
-    """A policy that acts on the estimate of a Kalman filter whose model is the task's own plant.
+class KalmanFilter(Remembering):
+    """A policy that acts on the estimate of a Kalman filter whose model is the task's own plant, whose whole
+    state is the chart.
 
     The errors of all coordinates are as large as each other in units of the noise, and the model passes them
     on as they are: then the gain of all is the same, k / (k + 1) of the variance.
@@ -55,21 +49,14 @@ class KalmanFilter:
     measurement), and the estimate for the next sample.
 
     Attributes:
-        task: the plant, whose whole state is the chart.
-        policy: acts on the estimate.
         drift: variance that each sample adds to that of the estimate, in units of that of the noise.
     """
 
-    task: Task
-    policy: Policy
     drift: float
     _plants: list[Any] = field(default_factory=list, repr=False, compare=False)
 
     def start(self, n: int) -> np.ndarray:
         return np.zeros((n, 1 + self.task.chart.dimension))
-
-    def act(self, measured: np.ndarray) -> np.ndarray:
-        return self.policy.act(measured)
 
     def act_after(self, memory: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         task, chart = self.task, self.task.chart

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hyrl_mj.alternatives.base import Alternative, Candidate, Given, register
+from hyrl_mj.alternatives.base import Alternative, Candidate, Given, Remembering, register
 from hyrl_mj.policies import Policy
 from hyrl_mj.tasks import Task
 
@@ -55,18 +55,13 @@ class HeldLevels:
 
 
 @dataclass(frozen=True)
-class HeldInputs:
+class HeldInputs(Remembering):
     """A policy on continuous inputs whose input is held; its memory is the input, and for how long yet."""
 
-    task: Task
-    policy: Policy
     samples: int
 
     def start(self, n: int) -> np.ndarray:
         return np.zeros((n, len(self.task.inputs) + 1))
-
-    def act(self, measured: np.ndarray) -> np.ndarray:
-        return self.policy.act(measured)
 
     def act_after(self, memory: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         u, left = memory[:, :-1].copy(), memory[:, -1].copy()

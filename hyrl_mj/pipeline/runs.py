@@ -19,7 +19,7 @@ from hyrl_mj.files.manifest import locked
 from hyrl_mj.judging import Arrivals, Failures
 from hyrl_mj.judging.game import LATTICE
 from hyrl_mj.learning import Settings, Training, changed, preset, setting_value
-from hyrl_mj.pipeline.steps import DIAGNOSIS, STAGES, extended_sets_stage, run_stage
+from hyrl_mj.pipeline.steps import DIAGNOSIS, STAGES, run_stage
 from hyrl_mj.policies import ALGORITHMS, FUNCTION, AnyPolicy, algorithms, read_agent
 from hyrl_mj.runs import directory
 from hyrl_mj.runs.directory import opened, write_config
@@ -250,8 +250,7 @@ def extend_again(run: directory.Run, horizon: float, say: Say = print) -> Run:
     """Runs stages 4 and 5 with another horizon T [s], and writes T to `config.json` if they succeed."""
     changed = directory.Run(run.path, replace(run.settings, horizon=horizon), run.function)
     with locked(run.path):
-        with changed.manifest.stage("extended-sets"):
-            extended_sets_stage(changed, lambda text: say(f"extended-sets: {text}"))
+        run_stage(changed, "extended-sets", say)
         write_config(changed, run.versions)
     say(f"go on with {beginning(changed, run.path)}")
     return load_run(run.path, run.function)

@@ -16,7 +16,6 @@ from hyrl_mj.errors import BadInput, NoRenderer, unknown
 from hyrl_mj.judging import (
     USUAL,
     Arrivals,
-    Examination,
     ExamineOptions,
     Failures,
     ModeResult,
@@ -231,7 +230,10 @@ def examine_stage(run: Run, say: Say, options: ExamineOptions = USUAL) -> None:
     for name, arc in found.arcs.items():
         arc.save(run.arc_path("attack", name))
     if found.maps is not None:
-        draw_robustness(run, found, run.path / "figures")
+        from hyrl_mj.viz import figures
+
+        shown = figures.Shown(run, game=found.robustness.game, maps=found.maps)
+        figures.draw_all(shown, run.path / "figures", "game")
         found.maps.save(run.path / "robustness.npz")
     found.robustness.save(run.path / "robustness.json")
     if run.agent and run.agent.why_no_function:
@@ -255,16 +257,6 @@ def subject_of(run: Run, controllers: dict[str, Controller], partition: Partitio
         effort=SPARING if s.preset == "smoke" else run.task.effort,
         attacks=s.attack,
     )
-
-
-def draw_robustness(run: Run, found: Examination, folder: Path) -> None:
-    """Draws the maps and the curve of the game."""
-    from hyrl_mj.viz import figures
-
-    assert found.robustness.game is not None
-    assert found.maps is not None
-    shown = figures.Shown(run, game=found.robustness.game, maps=found.maps)
-    figures.draw_all(shown, folder, "game")
 
 
 def simulate_stage(run: Run, say: Say) -> None:
@@ -317,9 +309,8 @@ def diagnose_stage(run: Run, say: Say) -> None:
     found = examine(subject_of(run, alone, run.partition))
     losses = losses_of(run)
     arc = worst_arc(run, losses)
-    figures.draw_all(figures.Shown(run, arc or usual_arc(run)), folder, "policy")
-    if found.maps is not None:
-        draw_robustness(run, found, folder)
+    shown = figures.Shown(run, arc or usual_arc(run), found.robustness.game, found.maps)
+    figures.draw_all(shown, folder, "policy", *(["game"] if found.maps is not None else []))
     diagnosis.write_worst(run, arc, say)
     found.robustness.save(folder / "robustness.json")
     results = sentences(run, found.robustness, arc, losses)
