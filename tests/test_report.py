@@ -319,12 +319,21 @@ def test_the_command_tells_what_is_not_the_default(copied):
     assert changed_settings(other) == []
 
 
-def test_what_the_command_does_not_repeat_is_named(copied):
-    agent = Agent("onnx", "agent.onnx", "0" * 64)
-    run = load_run(copied)
-    given = preset(run.task, "smoke", eps=0.1, agent=agent)
-    assert changed_settings(Run(copied, given)) == []
-    assert changed_settings(Run(copied, replace(given, cells=99))) == ["cells"]
+@pytest.mark.parametrize(
+    ("source", "told"),
+    [
+        ("agent.onnx", "hyrl-mj robustify vehicle --policy agent.onnx .* --set cells=99"),
+        ("", r"hyrl_mj\.robustify\('vehicle', policy, .* set=\{'cells': 99\}\)"),
+    ],
+)
+def test_the_command_of_an_agent_repeats_what_was_set(source, told, copied):
+    agent = Agent("onnx" if source else "function", source, "0" * 64)
+    given = preset(load_run(copied).task, "smoke", eps=0.1, agent=agent)
+    run = Run(copied, replace(given, cells=99))
+    assert re.fullmatch(told, beginning(run))
+    assert changed_settings(run) == []
+    fewer = replace(given.stage6, options={})  # as another version has made it
+    assert changed_settings(Run(copied, replace(given, stage6=fewer))) == ["stage6"]
 
 
 def test_the_same_artifacts_give_the_same_bytes(copied):

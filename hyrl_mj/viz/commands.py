@@ -33,8 +33,8 @@ def beginning(run: Run, out: Path | None = None) -> str:
         options["horizon"] = s.horizon
     if s.everywhere:
         options["all_coordinates"] = True
-    if not agent and (changes := _changes(run)):
-        options["set"] = [f"{name}={json.dumps(value)}" for name, value in changes.items()]
+    if changes := _changes(run):
+        options["set"] = changes
     if out is not None:
         options["out"] = str(out)
     if agent and not agent.source:
@@ -43,8 +43,10 @@ def beginning(run: Run, out: Path | None = None) -> str:
     words = ["hyrl-mj", *(["robustify", s.task, *agent.options] if agent else ["run", s.task])]
     for name, value in options.items():
         words.append(f"--{name.replace('_', '-')}")
-        if value is not True:
-            words += value if isinstance(value, list) else [f"{value}"]
+        if isinstance(value, dict):
+            words += [f"{setting}={json.dumps(new)}" for setting, new in value.items()]
+        elif value is not True:
+            words.append(f"{value}")
     return shlex.join(words)
 
 
@@ -70,9 +72,7 @@ def _examination(robustness: Robustness) -> str:
 
 def changed(run: Run) -> list[str]:
     """Returns the names of the settings that the command does not repeat with this version."""
-    s, again = run.settings, _again(run)
-    if not run.agent:
-        again = learning.changed(again, _changes(run))
+    s, again = run.settings, learning.changed(_again(run), _changes(run))
     compared = [name for name in vars(s) if _is_known(run) or name not in STAGES]
     return [n.replace("_", " ") for n in compared if getattr(s, n) != getattr(again, n)]
 
