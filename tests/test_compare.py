@@ -1,6 +1,5 @@
 """Comparisons: the alternatives do what they say, and all of them are made, tuned and judged alike."""
 
-import json
 import shutil
 import sys
 from copy import copy
@@ -617,14 +616,6 @@ def test_a_comparison_that_nobody_makes_is_refused(rows, tmp_path):
 def test_a_json_file_has_a_limit_of_parts(tmp_path):
     Compared("unit_circle", 0.1, "fast", {"a": [[]] * 20_000}, True).save(tmp_path)
     with pytest.raises(artifacts.BadArtifact, match="more than 10,000 parts"):
-        Compared.load(tmp_path)
-
-
-def test_a_damaged_comparison_is_refused(tmp_path):
-    Compared("unit_circle", 0.1, "fast", {}, True).save(tmp_path)
-    content = json.loads((tmp_path / "compare.json").read_text())
-    (tmp_path / "compare.json").write_text(json.dumps(content | {"eps": "much"}))
-    with pytest.raises(artifacts.BadArtifact):
         Compared.load(tmp_path)
 
 

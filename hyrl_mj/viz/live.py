@@ -17,7 +17,6 @@ from hyrl_mj.runs.arcs import OF_RUNS, critical_starts, noisy_arcs
 from hyrl_mj.runs.directory import Run
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import noise_kinds
-from hyrl_mj.system.progress import Say
 from hyrl_mj.viz.colours import BAD, CRITICAL, OVERLAP
 from hyrl_mj.viz.replay import marks
 from hyrl_mj.viz.replay.panel import Track
@@ -31,12 +30,12 @@ SELECTED = "selected by the first measurement"
 PLACES = 60  # cells along the longer side of the plane of places that the start is dragged to
 
 
-def live(run: Run, port: int = 0, say: Say = print) -> None:
+def live(run: Run, port: int = 0) -> None:
     """Serves a page on which a run is simulated as its user chooses, until it is interrupted.
 
     Args:
         run: whose stages up to the policies of the modes are finished.
-        port, say: as in `hyrl_mj.viz.viewing.view`.
+        port: as in `hyrl_mj.viz.viewing.view`.
 
     Raises:
         BadInput: no page can be served here; the message says why.
@@ -44,7 +43,7 @@ def live(run: Run, port: int = 0, say: Say = print) -> None:
     # The user of the page may change how a model is drawn; compiled models are shared.
     model = copy(run.task.model)
     data = mujoco.MjData(model)
-    with served(model, data, port, say) as (server, scene):
+    with served(model, data, port, print) as (server, scene):
         page = Page(run, server)
         last = time.monotonic()
         while True:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from numpy.typing import ArrayLike
 
 from hyrl_mj.errors import BadInput, unknown
@@ -32,22 +34,24 @@ def replay_shows(
     Raises:
         BadInput: a value that cannot be used.
     """
+    modes = run.extended_sets.modes
+    show = partial(Show, title=run.policy_title, modes=modes)
     if not isinstance(starts, str):
         z0 = run.task.chart.check(starts, run.task.name)
         found = noisy_arcs(run, z0, "alternating" if noise is None else noise, eps)
-        return [Show(found["policy"], found["hyrl"], run.policy_title, run.extended_sets.modes)]
+        return [show(found["policy"], found["hyrl"])]
     if starts not in (known := ("critical", "paper", "latest")):
         raise unknown("starts", starts, known)
-    is_new, modes = noise is not None or eps is not None, run.extended_sets.modes
+    is_new = noise is not None or eps is not None
     if starts == "latest":
         if is_new:
             raise BadInput(
                 "the latest simulation has its noise: give noise and eps to hyrl-mj simulate, not here"
             )
         policy, hybrid = ([run.arc(run.arc_path("latest", who))] for who in ("policy", "hyrl"))
-        return [Show(policy, hybrid, run.policy_title, modes)]
+        return [show(policy, hybrid)]
     if starts == "critical" and not is_new and (attacked := attack_replay(run)):
-        return [Show([attacked["policy"]], [attacked["hyrl"]], run.policy_title, modes)]
+        return [show([attacked["policy"]], [attacked["hyrl"]])]
     arcs = replay_arcs(run, noise, eps) if is_new else run.arcs()
     names = dict.fromkeys(name for name, _ in arcs)
     loops = [f"hyrl_q{q}" for q in modes]
@@ -55,10 +59,10 @@ def replay_shows(
         names.pop("critical", None)
         policy = [arcs[name, "policy"] for name in names]
         hybrid = [arcs[name, loop] for name in names for loop in loops]
-        return [Show(policy, hybrid, run.policy_title, modes)]
+        return [show(policy, hybrid)]
     name = "critical" if "critical" in names else next(iter(names))
     policy = [arcs[name, "policy"]]
-    return [Show(policy, [arcs[name, loop]], run.policy_title, modes) for loop in loops]
+    return [show(policy, [arcs[name, loop]]) for loop in loops]
 
 
 def replay_floor(run: Run, overlap: bool = True) -> Floors:
