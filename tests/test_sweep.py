@@ -30,7 +30,7 @@ from hyrl_mj.judging.game import Comparison, Curve, EpisodeCount, WinningShares
 from hyrl_mj.learning import changed, preset
 from hyrl_mj.physics import mjcf
 from hyrl_mj.pipeline import cluster, report
-from hyrl_mj.pipeline.board import Board
+from hyrl_mj.pipeline.sweeping import Board, _seen
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.runs import sweeps
 from hyrl_mj.runs.directory import Run, write_config
@@ -499,8 +499,6 @@ def test_a_cluster_of_two_machines_makes_runs_on_both_and_goes_on_after_one_that
 
 
 def test_a_machine_that_keeps_its_files_is_told_of(tmp_path):
-    from hyrl_mj.pipeline.sweeping import _seen
-
     kept = _seen(row(0), tmp_path, PLANTED)
     assert kept.state == "stopped"
     assert "share" in kept.sentence

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import sys
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.files.manifest import locked
 from hyrl_mj.pipeline import cluster
-from hyrl_mj.pipeline.board import Board
 from hyrl_mj.pipeline.runs import (
     BOUND,
     RunOptions,
@@ -197,3 +199,58 @@ def _seen(row: Row, folder: Path, common: Common) -> Row:
             f"this machine does not see its results: share {folder} between all machines"
         )
     return row
+
+
+class Board:
+    """Shows the stage and the time of each run: in a log a line for each stage, on a terminal a live one.
+
+    Args:
+        say: receives the lines instead.
+        count: number of runs.
+    """
+
+    def __init__(self, say: Say | None, count: int):
+        self._count, self._ended = count, 0
+        self._began: dict[str, float] = {}
+        self._latest: dict[str, str] = {}
+        self._live: Any = None
+        self._say: Say = say or partial(print, flush=True)
+        if say is None and sys.stdout is not None and sys.stdout.isatty():
+            from rich.live import Live
+
+            self._live = Live(get_renderable=self._picture, transient=True, refresh_per_second=2)
+            self._say = partial(self._live.console.print, markup=False, highlight=False)
+
+    def __enter__(self) -> Self:
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    def tell(self, row: Row, text: str) -> None:
+        """Shows what a run says about a stage."""
+        began = self._began.setdefault(row.name, time.monotonic())
+        self._latest[row.name] = text
+        if self._live is None:
+            self._say(f"{row.name}: {time.monotonic() - began:.0f} s: {text}")
+
+    def end(self, row: Row, how: str = "") -> None:
+        """Shows how a run ended."""
+        self._ended += 1
+        self._latest.pop(row.name, None)
+        end = row.sentence if row.verdict == "" else f"{row.verdict}: {row.sentence}"
+        end = end if row.done else f"stopped: {end}"
+        self._say(f"{row.name}: {row.seconds:.0f} s: {how}{end} ({self._ended} of {self._count})")
+
+    def _picture(self) -> Any:
+        from rich.text import Text
+
+        now = time.monotonic()
+        lines = [
+            f"{name}: {now - self._began[name]:.0f} s: {text}"
+            for name, text in self._latest.items()
+        ]
+        return Text("\n".join(lines), overflow="ellipsis", no_wrap=True)
