@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from textwrap import fill
 from typing import Any
 
@@ -44,7 +45,10 @@ def draw_extended_sets(shown: Shown) -> Figure:
         if shared.any():
             charts.legend_field(panels[0], "in several of them", OVERLAP, OVERLAP)
         for panel in panels:
-            (_set_rings if ring else _set_plane)(panel, shown, shared)
+            if ring:
+                _set_rings(panel, shown, shared)
+            else:
+                _set_plane(panel, shown, shared, range(len(sets.sets)))
         if enlarged:
             _enlarge(panels[0], panels[1], shown)
         style.legend(figure)
@@ -61,14 +65,8 @@ def _draw_each(shown: Shown, shared: np.ndarray, title: str) -> Figure:
     with style.drawing(1.5 + rows * panel_height, shown.section, title) as figure:
         panels = figure.subplots(rows, style.COLUMNS, squeeze=False).ravel()
         charts.legend_field(panels[0], "in another set, too", OVERLAP, OVERLAP)
-        for i, (panel, members) in enumerate(zip(panels, sets.sets, strict=False)):
-            both = GridSet.from_mask(members.grid, shared & members.mask)
-            charts.region(panel, members, style.mode_tint(i))
-            charts.region(panel, both, OVERLAP)
-            charts.region(panel, members, "none", mode_colour(i), zorder=2)
-            charts.plane(panel, shown.section)
-            charts.dots(panel, shown.critical.points)
-            mode = sets.modes[i]
+        for i, (panel, mode) in enumerate(zip(panels, sets.modes, strict=False)):
+            _set_plane(panel, shown, shared & sets.sets[i].mask, [i])
             name = f"{style.set_label(mode, extended=True)}, of mode {shown.task.mode_name(mode)}"
             title = fill(name, 40)  # letters of a line above a panel of two
             panel.set_title(title, color=mode_colour(i), fontweight="bold")
@@ -103,14 +101,14 @@ def _ends(panel: Axes, chart: Chart, members: GridSet, radius: float, colour: st
         panel.text(x, y, text, color=colour, ha="center", va="center", fontsize=9)
 
 
-def _set_plane(panel: Axes, shown: Shown, shared: np.ndarray) -> None:
-    """Fills the sets in a plane, with outlines."""
-    sets = shown.sets
-    for i, members in enumerate(sets.sets):
-        charts.region(panel, members, style.mode_tint(i))
-    charts.region(panel, GridSet.from_mask(sets.sets[0].grid, shared), OVERLAP)
-    for i, members in enumerate(sets.sets):
-        charts.region(panel, members, "none", mode_colour(i), zorder=2)
+def _set_plane(panel: Axes, shown: Shown, shared: np.ndarray, places: Sequence[int]) -> None:
+    """Fills the sets at some places in a plane, with what of them (N,) others hold, too, and outlines."""
+    sets = shown.sets.sets
+    for i in places:
+        charts.region(panel, sets[i], style.mode_tint(i))
+    charts.region(panel, GridSet.from_mask(sets[0].grid, shared), OVERLAP)
+    for i in places:
+        charts.region(panel, sets[i], "none", mode_colour(i), zorder=2)
     charts.plane(panel, shown.section)
     charts.dots(panel, shown.critical.points)
 
