@@ -410,10 +410,13 @@ def test_bad_forms_and_places(circle, tmp_path):
     for name in ("controller.py", "controller.npz"):
         (mine := tmp_path / name).write_text("mine")
         with pytest.raises(BadInput, match=f"{name} exists and is no exported controller"):
-            FORMS["numpy"](controller, tmp_path)
+            export_numpy(controller, tmp_path)
         assert mine.read_text() == "mine"
         assert {p.name for p in tmp_path.iterdir()} == {"file", name}
-        mine.unlink()
+        FORMS["numpy"](controller, tmp_path)  # as with --force
+        export_numpy(controller, tmp_path)
+        for path in files_of("numpy", tmp_path):
+            path.unlink()
 
 
 def test_without_onnx_it_says_what_to_install(circle, tmp_path, monkeypatch):

@@ -47,9 +47,16 @@ def export_numpy(
     Raises:
         BadInput: the controller cannot be exported, or the files cannot be written.
     """
+    if taken := [path for path in files_of("numpy", Path(folder)) if not _is_free(path)]:
+        raise BadInput(f"{taken[0]} exists and is no exported controller: choose another folder")
+    return _write_numpy(controller, folder, field)
+
+
+def _write_numpy(
+    controller: Exportable, folder: str | Path, field: str | Path | None = None
+) -> list[Path]:
+    """Does what `export_numpy` does, whatever files are there."""
     controller, folder = exported_controller(controller, field), Path(folder)
-    if taken := next((path for path in files_of("numpy", folder) if not _is_free(path)), None):
-        raise BadInput(f"{taken} exists and is no exported controller: choose another folder")
     with tempfile.TemporaryDirectory() as temporary:
         written = _write(controller, Path(temporary))
         _check(controller, run_path(str(written[0]))["step"], "the NumPy form")
@@ -124,7 +131,8 @@ def export_onnx(controller: Exportable, path: str | Path, field: str | Path | No
     return path
 
 
-FORMS: dict[str, Callable[..., Any]] = {"onnx": export_onnx, "numpy": export_numpy}
+# For the command line, which has asked whether the files may be written.
+FORMS: dict[str, Callable[..., Any]] = {"onnx": export_onnx, "numpy": _write_numpy}
 
 
 def files_of(form: str, out: Path) -> list[Path]:
