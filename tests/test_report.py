@@ -5,8 +5,10 @@ from __future__ import annotations
 import errno
 import io
 import json
+import os
 import re
 import shutil
+import subprocess
 from base64 import b64decode
 from dataclasses import asdict, replace
 from html import escape
@@ -15,7 +17,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import chromium, needs_chromium
 from command_line import contents
 from PIL import Image
 from planted import Cube, believe, decisions, extended, halves, without_pdfs, without_pictures
@@ -473,6 +474,28 @@ def test_a_failed_write_leaves_the_last_report(copied, monkeypatch):
 
 
 # ---- how it looks
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "google-chrome"))), None)
+
+needs_chromium = pytest.mark.skipif(
+    "CI" not in os.environ and CHROMIUM is None, reason="no chromium on this machine"
+)
+
+
+def chromium(page, profile, width=1280, height=6000, *arguments):
+    """Open a page; what the browser wrote to its standard output."""
+    assert CHROMIUM is not None, "apt-get install chromium"
+    done = subprocess.run(
+        [
+            CHROMIUM, "--headless=new", "--no-sandbox", "--disable-gpu", "--hide-scrollbars",
+            "--disable-dev-shm-usage", "--no-first-run", f"--user-data-dir={profile}",
+            f"--window-size={width},{height}", *arguments, page.as_uri(),
+        ],
+        capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
 
 PROBE = """<script>
 const inside = e => e.parentElement.closest(".scroll, pre");
