@@ -1,22 +1,25 @@
 """Why starts are lost: indecision that holding the way cures, or passing closer than the noise."""
 
+from types import SimpleNamespace
+
 import numpy as np
 from planted import ChartPolicy, halves, pass_on, sign_policy
 
 from hyrl_mj import simulate
 from hyrl_mj.judging.game import NEVER, Game
 from hyrl_mj.policies import PolicyController
-from hyrl_mj.runs.diagnosis import losses_sentence, sort_losses
+from hyrl_mj.runs.diagnosis import losses_of, losses_sentence
 from hyrl_mj.sets import Grid
-from hyrl_mj.stages import part_policies
 
 EPS, CELLS = 0.1, 120
 
 
-def sorted_losses(task, policy, eps):
-    parts = halves(task)
-    pis = part_policies(task, policy, parts, eps)
-    return sort_losses(task, policy, parts.parts, [*pis.values()], eps, CELLS)
+def sorted_losses(task, policy):
+    settings = SimpleNamespace(eps=EPS, lattice=CELLS)
+    run = SimpleNamespace(
+        task=task, steady=policy, partition=halves(task), settings=settings, exact=True
+    )
+    return losses_of(run)
 
 
 def lost_by(task, policy):
@@ -33,7 +36,7 @@ def grazing_policy(task):
 
 def test_a_policy_that_only_cannot_decide_is_cured_by_hysteresis(vehicle):
     policy = sign_policy(vehicle)
-    losses = sorted_losses(vehicle, policy, EPS)
+    losses = sorted_losses(vehicle, policy)
     assert len(losses.undecided) == len(lost_by(vehicle, policy)) > 20
     assert not len(losses.grazing)
     assert not len(losses.unaided)
@@ -45,7 +48,7 @@ def test_a_policy_that_only_cannot_decide_is_cured_by_hysteresis(vehicle):
 
 def test_a_policy_that_passes_too_close_is_not(vehicle):
     policy = grazing_policy(vehicle)
-    losses = sorted_losses(vehicle, policy, EPS)
+    losses = sorted_losses(vehicle, policy)
     sizes = [len(z) for z in (losses.unaided, losses.undecided, losses.grazing)]
     assert sum(sizes) == len(lost_by(vehicle, policy))
     assert sizes[2] > 5 * sizes[1]
@@ -61,7 +64,7 @@ def test_a_policy_that_passes_too_close_is_not(vehicle):
 
 def test_a_policy_that_stands_still_fails_without_noise(circle):
     policy = ChartPolicy(circle, lambda z: np.zeros((len(z), 1)))
-    losses = sorted_losses(circle, policy, EPS)
+    losses = sorted_losses(circle, policy)
     assert len(losses.unaided) == len(lost_by(circle, policy)) > 5
     assert not len(losses.undecided)
     assert not len(losses.grazing)

@@ -31,16 +31,15 @@ from hyrl_mj.simulation import (
 from hyrl_mj.tasks import Task
 
 
-def from_middle(task: Task, z: np.ndarray) -> np.ndarray:
-    """Returns the distances (n,) of chart points (n, d) from the middle of the replay starts."""
-    middle = np.mean(task.scene.starts, axis=0)
-    return np.asarray(np.linalg.norm(task.chart.difference(z, middle), axis=1))
+def near_middle(task: Task, z: np.ndarray, most: int) -> np.ndarray:
+    """Returns so many of chart points (n, d): the nearest to the middle of the replay starts, these first."""
+    off = task.chart.difference(z, np.mean(task.scene.starts, axis=0))
+    return z[np.argsort(np.linalg.norm(off, axis=1), kind="stable")[:most]]
 
 
 def critical_starts(run: Run) -> np.ndarray:
     """Returns the 16 points (n, d) of M* that are nearest to the replay starts, the nearest first."""
-    points = run.critical_set.points
-    return points[np.argsort(from_middle(run.task, points), kind="stable")[:16]]
+    return near_middle(run.task, run.critical_set.points, 16)
 
 
 def noisy_arcs(

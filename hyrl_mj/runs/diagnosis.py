@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,13 +25,12 @@ from hyrl_mj.judging.game import (
     percent,
     worst_signal,
 )
-from hyrl_mj.policies import Policy, PolicyController
-from hyrl_mj.runs.arcs import critical_starts, from_middle
+from hyrl_mj.policies import PolicyController
+from hyrl_mj.runs.arcs import critical_starts, near_middle
 from hyrl_mj.runs.directory import Run
-from hyrl_mj.sets import GridSet, within_reach
+from hyrl_mj.sets import within_reach
 from hyrl_mj.simulation import HybridArc, Noise, simulate_batch
 from hyrl_mj.stages import part_policies
-from hyrl_mj.tasks import Task
 
 
 @dataclass(frozen=True)
@@ -51,47 +50,27 @@ class Losses:
     grazing: np.ndarray
 
 
-def sort_losses(
-    task: Task,
-    policy: Policy,
-    parts: Sequence[GridSet],
-    pis: Sequence[Policy],
-    eps: float,
-    cells: int,
-) -> Losses:
-    """Sorts the winnable starts that a policy loses to the worst noise.
-
-    Each part's policy pi_i (paper, Step 4) plays the game alone. A start is won by holding the way if all
-    pi_i win that the first measurement can select.
-
-    Args:
-        task: the robot and its problem.
-        policy: the policy, a function of the measurement.
-        parts: M_i of each mode.
-        pis: pi_i of each mode.
-        eps: the noise bound.
-        cells: lattice cells along the longest side, as in `curve_grid`.
-    """
-    loops = {f"part {i}": PolicyController(pi) for i, pi in enumerate(pis)}
-    grid = curve_grid(task, cells)
-    game = Game(task, parts, {"policy": PolicyController(policy), **loops}, eps, grid=grid)
-    lost = game.starts & game.winnable(eps) & (game.value("policy", eps)[-1, :-2] >= NEVER)
-    held = np.ones(len(lost), dtype=bool)
-    window = np.ceil(game.bound(eps) / grid.spacing).astype(int)
-    for name, side in zip(loops, game.limit.sides, strict=True):
-        selected = within_reach(side.reshape(grid.counts), window, task.chart.periodic).ravel()
-        held &= ~selected | (game.value(name, eps)[-1, :-2] < NEVER)
-    nodes, alone = grid.nodes, game.value("policy", 0.0)[-1, :-2] >= NEVER
-    return Losses(nodes[lost & alone], nodes[lost & ~alone & held], nodes[lost & ~alone & ~held])
-
-
 def losses_of(run: Run) -> Losses | None:
-    """Returns why the policy loses starts, where the game decides."""
+    """Returns why the policy loses winnable starts to the worst noise, where the game decides.
+
+    Each part's policy pi_i (paper, Step 4) plays the game alone, on the lattice of `curve_grid`. A start is
+    won by holding the way if all pi_i win that the first measurement can select.
+    """
     if not run.exact:
         return None
-    task, policy, parts, s = run.task, run.steady, run.partition, run.settings
-    pis = part_policies(task, policy, parts, s.eps)
-    return sort_losses(task, policy, parts.parts, [*pis.values()], s.eps, s.lattice)
+    task, policy, s = run.task, run.steady, run.settings
+    pis = part_policies(task, policy, run.partition, s.eps)
+    loops = {f"part {q}": PolicyController(pi) for q, pi in pis.items()}
+    grid, both = curve_grid(task, s.lattice), {"policy": PolicyController(policy), **loops}
+    game = Game(task, run.partition.parts, both, s.eps, grid=grid)
+    lost = game.starts & game.winnable(s.eps) & (game.value("policy", s.eps)[-1, :-2] >= NEVER)
+    held = np.ones(len(lost), dtype=bool)
+    window = np.ceil(game.bound(s.eps) / grid.spacing).astype(int)
+    for name, side in zip(loops, game.limit.sides, strict=True):
+        selected = within_reach(side.reshape(grid.counts), window, task.chart.periodic).ravel()
+        held &= ~selected | (game.value(name, s.eps)[-1, :-2] < NEVER)
+    nodes, alone = grid.nodes, game.value("policy", 0.0)[-1, :-2] >= NEVER
+    return Losses(nodes[lost & alone], nodes[lost & ~alone & held], nodes[lost & ~alone & ~held])
 
 
 def worst_arc(run: Run, losses: Losses | None) -> HybridArc | None:
@@ -106,7 +85,7 @@ def worst_arc(run: Run, losses: Losses | None) -> HybridArc | None:
     if losses is not None:
         parts = losses.grazing, losses.undecided, losses.unaided
         kinds = sorted(parts, key=len, reverse=True)
-        z0 = np.vstack([z[np.argsort(from_middle(task, z), kind="stable")[:64]] for z in kinds])
+        z0 = np.vstack([near_middle(task, z, 64) for z in kinds])
         if not len(z0):
             return None
         game = Game(task, run.partition, {"policy": loop}, eps, grid=run.lattice_grid)
