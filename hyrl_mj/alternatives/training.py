@@ -78,9 +78,7 @@ def learned(
             model.learn(samples or settings.samples, callback=best)
         except (HyrlError, OSError):
             raise
-        except (
-            Exception
-        ) as error:  # whatever SB3 and torch raise, as of weights that are not finite
+        except Exception as error:  # of SB3 or torch, as of weights that are not finite
             raise BadInput(
                 f"its training broke off after {model.num_timesteps:,} samples ({brief(error)})"
             ) from error

@@ -267,9 +267,8 @@ def proved_text(share: float | None) -> str:
 
 def miss_unit(task: Task) -> str:
     """Returns the unit of how far off the set-point a robot is."""
-    own = (
-        task.source is not None and type(task).miss is not Task.miss
-    )  # which may tell metres of angles
+    # A method of the user's own may tell metres of angles.
+    own = task.source is not None and type(task).miss is not Task.miss
     return "as miss() tells" if own else task.chart.unit
 
 

@@ -59,9 +59,8 @@ def _draw_each(shown: Shown, shared: np.ndarray, title: str) -> Figure:
     """Draws each set of a plane in a panel of its own, and what of it other sets hold, too (N,)."""
     sets, (width, height) = shown.sets, shown.section.chart.sides
     rows = -(-len(sets.sets) // style.COLUMNS)
-    panel_height = (
-        0.8 * style.WIDTH / style.COLUMNS * height / width + 0.8
-    )  # labels beside and around
+    # With labels beside and around.
+    panel_height = 0.8 * style.WIDTH / style.COLUMNS * height / width + 0.8
     with style.drawing(1.5 + rows * panel_height, shown.section, title) as figure:
         panels = figure.subplots(rows, style.COLUMNS, squeeze=False).ravel()
         charts.legend_field(panels[0], "in another set, too", OVERLAP, OVERLAP)
