@@ -1,4 +1,6 @@
-"""The command line, called in this process: one of its own would import everything again; and other code."""
+"""The command line, called in this process: one of its own would import everything again; other code, and who
+listens.
+"""
 
 import contextlib
 import io
@@ -42,3 +44,13 @@ def python(code, *words, **options):
     return subprocess.run(
         command, capture_output=True, text=True, timeout=90, check=False, **options
     )
+
+
+def listening():
+    """The address, the port and the inode of each socket to which somebody listens, as Linux writes them."""
+    for name in ("tcp", "tcp6"):
+        if (table := Path("/proc/net") / name).exists():
+            for words in map(str.split, table.read_text().splitlines()[1:]):
+                address, port = words[1].split(":")
+                if words[3] == "0A":
+                    yield address, int(port, 16), words[9]

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from attacks.crafted_runs import MARKER
 from attacks.doors import plant_modules
-from command_line import call
+from command_line import call, listening
 from planted import FEW_CELLS, TINY, coarsen, decisions, few_noises, halves, shorten, spare
 from test_report import plant
 
@@ -318,7 +318,7 @@ def test_what_runs_say_reads_well_in_a_log():
 # ---- whole sweeps
 
 
-def listening():
+def own_addresses():
     """The addresses, as in /proc/net/tcp, at which the processes listen that belong to this one."""
     parents = {}
     for folder in Path("/proc").glob("[0-9]*"):
@@ -333,17 +333,7 @@ def listening():
     for pid in own:
         with suppress(OSError):
             sockets |= {os.readlink(path) for path in Path(f"/proc/{pid}/fd").iterdir()}
-    lines = [
-        line.split()
-        for table in ("tcp", "tcp6")
-        for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]
-    ]
-    listens = "0A"
-    return {
-        words[1].split(":")[0]
-        for words in lines
-        if words[3] == listens and f"socket:[{words[9]}]" in sockets
-    }
+    return {address for address, _, inode in listening() if f"socket:[{inode}]" in sockets}
 
 
 def made_shortly(row, options, *more):
@@ -366,7 +356,7 @@ def make_sweep(folder):
 
     def say(text):
         said.append(text)
-        addresses.update(listening())
+        addresses.update(own_addresses())
 
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(here)

@@ -8,11 +8,11 @@ import threading
 import urllib.error
 import urllib.request
 from contextlib import contextmanager
-from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
+from command_line import listening
 from planted import ideal_controller
 
 import hyrl_mj
@@ -114,18 +114,6 @@ def headless(monkeypatch):
     monkeypatch.setattr(viewing, "has_display", lambda: False)
 
 
-def listeners(port):
-    """The addresses on which this machine listens to a port, as Linux writes them."""
-    rows = [
-        row.split()
-        for name in ("tcp", "tcp6")
-        if (table := Path("/proc/net") / name).exists()
-        for row in table.read_text().splitlines()[1:]
-    ]
-    local = [row[1].rsplit(":", 1) for row in rows if row[3] == "0A"]
-    return [address for address, number in local if int(number, 16) == port]
-
-
 def port_of(said):
     """The port in the sentence that says where the page is."""
     return int(re.search(r"http://127\.0\.0\.1:(\d+)/", said)[1])
@@ -175,7 +163,7 @@ def test_the_page_is_served_to_this_machine_alone(vehicle, arc, headless, capsys
         with page_of(port) as page:
             page.recv(timeout=10)  # it still serves who asks for more
         if sys.platform == "linux":
-            assert listeners(port) == ["0100007F"]
+            assert [address for address, at, _ in listening() if at == port] == ["0100007F"]
         raise Enough
 
     with pytest.raises(Enough):
