@@ -438,7 +438,11 @@ def test_arcs_of_other_tasks_and_models_are_refused(tmp_path, show, circle):
         ("a.mp4", {"size": (0, 0)}, "0 x 0 pixels"),
         ("a.mp4", {"size": (100_000, 100_000)}, "to 4096 x 4096"),
         ("a.mp4", {"fps": 0}, "fps 0 cannot be used: give an integer from 1 to 240"),
-        ("a.mp4", {"slow_motion": 0.5}, "slow_motion 0.5 cannot be used: give a number from 1 to 100"),
+        (
+            "a.mp4",
+            {"slow_motion": 0.5},
+            "slow_motion 0.5 cannot be used: give a number from 1 to 100",
+        ),
         ("a.mp4", {"slow_motion": float("nan")}, "slow_motion nan"),
         ("a.mp4", {"layout": "tiled"}, "unknown layout 'tiled'.*side-by-side, overlay"),
         ("a.mp4", {"camera": "top"}, "'top'.*overhead, three_quarter, chase"),
