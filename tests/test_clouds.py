@@ -89,7 +89,7 @@ def test_nodes_lie_on_their_own_side(half):
 def test_values_that_are_linear_are_interpolated_exactly():
     cloud, slope = Cloud.even(BOX, 2_000, SHARES), np.array([1.0, -2, 0.5, 0, 3, 1])
     z = drawn(500, 3) * 0.9
-    found = cloud.interpolate(cloud.nodes @ slope + 0.2, z)
+    found = cloud.evaluation(cloud.nodes @ slope + 0.2)(z)
     np.testing.assert_allclose(found, z @ slope + 0.2, atol=5e-3)
 
 

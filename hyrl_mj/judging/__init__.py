@@ -4,7 +4,7 @@ Behind it are the worst-case game (`game`), what is proved between its nodes (`p
 (`worst_case`), noisy episodes, and an attack that searches for noise. `Verdict` is a function of the results.
 """
 
-from hyrl_mj.judging.attacks import Attack, Budget, attack, attack_starts
+from hyrl_mj.judging.attacks import Budget, attack, attack_starts
 from hyrl_mj.judging.episodes import Regions, noisy_episodes
 from hyrl_mj.judging.evidence import VerdictSettings, by_kind
 from hyrl_mj.judging.examination import USUAL, Examination, ExamineOptions, Subject, examine
@@ -16,7 +16,6 @@ __all__ = [
     "POLICIES",
     "USUAL",
     "Arrivals",
-    "Attack",
     "Budget",
     "Examination",
     "ExamineOptions",

@@ -15,8 +15,6 @@ from hyrl_mj.tasks import Outcome, Task
 
 # Number of episodes from which arrivals are counted.
 EPISODES = 1_000
-# Number of them that an environment's own judge plays before.
-JUDGED = 64
 
 
 @dataclass(frozen=True)
@@ -58,7 +56,7 @@ class Arrivals(artifacts.SavedAsJson):
         """Counts the arrivals of a policy from starts of the task, which are the same each time."""
         starts = task.starts(EPISODES, np.random.default_rng(0))
         if type(task).verify is not Task.verify:  # an environment may not be what it seems
-            simulate(task, policy, starts[:JUDGED])
+            simulate(task, policy, starts[:64])  # its own judge plays them, too
         run = _episodes(task, policy)
         arrived = run.outcome == Outcome.REACHED
         missed = arrived & ~task.arrived(run.path[-1])

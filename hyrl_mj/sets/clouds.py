@@ -173,10 +173,6 @@ class Cloud:
             found[part] = planes.slopes(x, rises, planes.closeness(distance[part]))
         return found
 
-    def interpolate(self, values: np.ndarray, z: np.ndarray) -> np.ndarray:
-        """Returns values (n,) at points (n, d), exact for linear functions of the chart."""
-        return self._blended(values, self.slopes(values), z)
-
     def _blended(self, values: np.ndarray, slopes: np.ndarray, z: np.ndarray) -> np.ndarray:
         """Returns values (n,) at points (n, d) from those of the nodes nearby and their slopes (N, d).
 

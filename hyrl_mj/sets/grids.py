@@ -86,11 +86,8 @@ class Grid:
     @cached_property
     def nodes(self) -> np.ndarray:
         """All nodes (N, d); the last coordinate varies fastest."""
-        axes = [
-            low + step * np.arange(count)
-            for low, step, count in zip(self.chart.low, self.spacing, self.counts, strict=True)
-        ]
-        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
+        index = np.stack(np.indices(self.counts), axis=-1).reshape(-1, len(self.counts))
+        return self.chart.origin + self.spacing * index
 
     @cached_property
     def _last(self) -> np.ndarray:

@@ -343,7 +343,7 @@ class Episodes(ModeGround):
         first = rng.choice(picked if len(picked) else self.early, 4 * episodes)
         z = self.grid.around(first, rng)
         # A start may be lost for any policy if not all nodes around it are wanted.
-        sure = np.flatnonzero(self.grid.interpolate(self.wanted.astype(float), z) > 1 - 1e-9)
+        sure = np.flatnonzero(self.grid.evaluation(self.wanted.astype(float))(z) > 1 - 1e-9)
         self.begins = z[np.resize(sure if len(sure) else np.arange(len(z)), episodes)]
         self.batches = np.split(np.arange(episodes), np.cumsum(sizes)[:-1])
         self._plants = {n: task.plant(n) for n in set(sizes)}

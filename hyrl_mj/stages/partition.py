@@ -21,11 +21,6 @@ from hyrl_mj.stages.refinement import refined, thinned
 from hyrl_mj.stages.ways import HomotopyClasses
 from hyrl_mj.tasks import ANY, Outcome, Task, number_of
 
-# The neighbourhood of M* is at least this many cells wide, and as wide as the longest hop in one sample.
-# Of more than two parts some are wedges: without a wide neighbourhood they begin far from M*, where a policy
-# goes straight on because it is clear of the obstacle.
-NEIGHBOURHOOD_CELLS, CELLS_OF_WEDGES = 4, 1.5
-
 
 @dataclass(frozen=True)
 class Partition(Saved):
@@ -339,9 +334,13 @@ def part_policies(
 
 
 def neighbourhood(partition: Partition, eps: float, hop: np.ndarray) -> float:
-    """Returns the width of the neighbourhood of M*: the noise, some cells, or one sample's hop (d,)."""
+    """Returns the width of the neighbourhood of M*: the noise, some cells, or one sample's hop (d,).
+
+    Of more than two parts some are wedges. A wide neighbourhood would cut them back far from M*, to where a
+    policy goes straight on because it is clear of the obstacle.
+    """
     grid = partition.grid
-    cells = NEIGHBOURHOOD_CELLS if len(partition.parts) <= 2 else CELLS_OF_WEDGES
+    cells = 4 if len(partition.parts) <= 2 else 1.5
     return max(eps, cells * grid.cell, float(np.linalg.norm(hop / grid.chart.scale)))
 
 

@@ -63,11 +63,8 @@ class Answers:
             )
         grid, modes = lattice.grid, controller.modes
         pad = np.where(grid.chart.periodic, 0, nodes_within(lattice, bound))
-        axes = [
-            low + step * np.arange(-k, n + k)
-            for low, step, n, k in zip(grid.chart.low, grid.spacing, grid.counts, pad, strict=True)
-        ]
-        measured = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+        index = np.stack(np.indices(grid.counts + 2 * pad), axis=-1) - pad
+        measured = grid.chart.origin + grid.spacing * index
 
         def answer(q: int | None, points: np.ndarray) -> np.ndarray:
             """Returns the answers (n,) at chart points (n, d) in a mode, or before the start if q is None."""
@@ -86,9 +83,9 @@ class Answers:
 
         answers, all_settled = [], []
         # An answer is settled if it is the same this far beside its measurement.
-        beside = 1e-4 * grid.spacing * np.eye(len(axes))[bound > 0]
+        beside = 1e-4 * grid.spacing * np.eye(len(pad))[bound > 0]
         for q in (*modes, None):
-            index = answers_of(q, measured.reshape(-1, len(axes))).reshape(measured.shape[:-1])
+            index = answers_of(q, measured.reshape(-1, len(pad))).reshape(measured.shape[:-1])
             settled = np.ones(index.shape, dtype=bool)
             at = np.nonzero(_borders(index, grid.chart.periodic))
             if len(at[0]) and len(beside):

@@ -27,8 +27,6 @@ ROUNDING = 16 * float(np.finfo(float).eps)
 ALIKE = 1e-3
 # States from which it is tried how evenly the plant moves, and samples of each run.
 STATES, SAMPLES = 3_000, 3
-# Nodes along each side of the lattice on which it is tried whether there are cells.
-FEW = 61
 
 
 @dataclass(frozen=True)
@@ -106,8 +104,7 @@ class Cells(Places):
         bias = Sensor.parse(task.sensor).bounds(task)[1] / h if task.sensor else 0.0
         reach = np.ceil(np.abs(cells).max(axis=0) + 1 + bias).astype(int)
         margin = np.where(periodic, 0, reach)
-        axes = [np.arange(-m, n + m) for m, n in zip(margin, counts, strict=True)]
-        index = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+        index = np.stack(np.indices(counts + 2 * margin), axis=-1) - margin
         centre, half = grid.chart.low + h * (index.reshape(-1, len(h)) + 0.5), h / 2 + slack
         fails, ends, success = _ends(task, Affine.box(centre, half))
         # Beyond the chart the episode has to end as a success now, or after whatever comes next.
@@ -331,9 +328,10 @@ def _carried(lattice: Lattice) -> np.ndarray:
 def why_no_cells(task: Task, counts: tuple[int, ...]) -> str | None:
     """Returns why no cells cover this task's chart, so that a game proves nothing and decides nothing.
 
-    None if they do. The cells are tried on few nodes, the plant at the distances of a grid of `counts` nodes.
+    None if they do. The cells are tried on at most 61 nodes along each side, the plant at the distances of a
+    grid of `counts` nodes.
     """
-    few = tuple(min(count, FEW) for count in counts)
+    few = tuple(min(count, 61) for count in counts)
     try:
         Cells.cover(Lattice.tabulate(task, Grid(task.chart, few)), Grid(task.chart, counts).spacing)
     except (Unbounded, BadInput) as error:

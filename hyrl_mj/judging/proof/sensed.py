@@ -23,8 +23,6 @@ from hyrl_mj.simulation import Sensor
 # Parts of the range of a bias, for one noisy coordinate and for several. A bias lies anywhere in its part, so
 # that failures are wider by half of that: with more parts more is proved.
 BIASES, FEWER_BIASES = 8, 3
-# States of a game times what the sensor may do with a sample, at most: about 50 bytes each.
-MOST_STATES = 2**25
 Shift = tuple[int, ...]
 
 
@@ -124,10 +122,11 @@ def proved_cells(
     wide = cells.widened(rest)
     used = (shift for some in answers.shifts for shift, chosen in some if chosen.any())
     shifts = sorted({tuple(shift.tolist()) for shift in used})
-    states = cells.nodes * len(answers.goes) * (1 + (sensor.held > 0))
+    # States of a game, times what the sensor may do with a sample, take about 50 bytes each.
+    most = 2**25 // (cells.nodes * len(answers.goes) * (1 + (sensor.held > 0)))
     own, some = np.ones((2, cells.nodes), dtype=bool)
     for delay in range(sensor.delays[0], sensor.delays[1] + 1):
-        memory = Memory.of_sensor(shifts, delay, sensor.held, MOST_STATES // states)
+        memory = Memory.of_sensor(shifts, delay, sensor.held, most)
         if memory is None:
             return None
         for part in product(*map(range, parts)):
