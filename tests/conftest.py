@@ -15,11 +15,14 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import hypothesis
 import memory
+import numpy as np
 import pytest
 from filelock import FileLock
 
 import hyrl_mj
+from hyrl_mj.judging.game import Game
 from hyrl_mj.physics import mjcf
+from hyrl_mj.sets import Grid
 from hyrl_mj.system import cores
 from hyrl_mj.tasks.scaffold import write_task
 
@@ -119,6 +122,44 @@ def vehicle():
 def task(request):
     """Either of the paper's tasks."""
     return hyrl_mj.get_task(request.param)
+
+
+@pytest.fixture(scope="session")
+def on_vehicle(vehicle):
+    """The worst-case game of the vehicle against planted controllers.
+
+    All but the first line and the slanted one run between the nodes, where the plant's rounding errors do not
+    matter.
+    """
+    from planted import halves, ideal_controller, one_way_policy, sign_policy
+
+    rules = {
+        "left": one_way_policy(vehicle, 1.0),
+        "right": one_way_policy(vehicle, -1.0),
+        "sign": sign_policy(vehicle),
+        "sign off": sign_policy(vehicle, lambda x: 0.004 + 0 * x),
+        "slanted": sign_policy(vehicle, lambda x: x - 0.3),
+        "narrow": ideal_controller(vehicle, 0.054, 0.954),
+        "ideal": ideal_controller(vehicle, 0.154, 1.004),
+        "grazing": ideal_controller(vehicle, 0.204, 0.904),
+    }
+    return Game(vehicle, halves(vehicle), rules, 0.2, grid=Grid.with_cells(vehicle.chart, 240))
+
+
+@pytest.fixture(scope="session")
+def on_circle(circle):
+    """The same of the unit circle, on 754 nodes: at full speed samples lead from node to node.
+
+    2 pi / 754 = 0.05 / 6.00003.
+    """
+    from planted import circle_controller, circle_policy, halves, homing_controller
+
+    rules = {
+        "sign": circle_policy(circle, np.pi + 0.003),
+        "hysteresis": circle_controller(circle, 0.4 + 0.003),
+        "homing": homing_controller(circle, 0.4 + 0.003),
+    }
+    return Game(circle, halves(circle), rules, 0.3, grid=Grid.with_cells(circle.chart, 754))
 
 
 @pytest.fixture(scope="session")

@@ -8,7 +8,6 @@ import pytest
 from planted import (
     circle_controller,
     circle_policy,
-    decisions,
     halves,
     homing_controller,
     homing_policy,
@@ -163,24 +162,6 @@ def test_a_controller_that_goes_to_a_mode_it_does_not_have_is_refused(vehicle):
 
 # ---- vehicle: planted controllers
 
-OFF = 0.004  # lines run between the nodes, where the plant's rounding errors do not matter
-
-
-@pytest.fixture(scope="module")
-def on_vehicle(vehicle):
-    controllers = {
-        "left": PolicyController(one_way_policy(vehicle, 1.0)),
-        "right": PolicyController(one_way_policy(vehicle, -1.0)),
-        "sign": PolicyController(sign_policy(vehicle)),
-        "sign off": PolicyController(sign_policy(vehicle, lambda x: OFF + 0 * x)),
-        "slanted": PolicyController(sign_policy(vehicle, lambda x: x - 0.3)),
-        "ideal": ideal_controller(vehicle, 0.2 + OFF, 0.95 + OFF),
-        "narrow": ideal_controller(vehicle, 0.05 + OFF, 0.95 + OFF),
-    }
-    grid = Grid.with_cells(vehicle.chart, 240)
-    game = Game(vehicle, halves(vehicle), controllers, 0.2, grid=grid)
-    return game, controllers
-
 
 def own(game, name, eps):
     """The value (N,) of nodes where the controller picks its start mode."""
@@ -188,20 +169,16 @@ def own(game, name, eps):
 
 
 def test_one_way_wins_the_starts_whose_way_is_open(on_vehicle):
-    game, _ = on_vehicle
-    x, y = game.lattice.grid.nodes.T
-    for name, side, samples in zip(("left", "right"), (1, -1), game.limit.samples, strict=True):
-        room, cell = LAST_CHANCE - x + side * y, game.lattice.grid.cell
+    game = on_vehicle
+    for name, samples in zip(("left", "right"), game.limit.samples, strict=True):
         for eps in (0.0, 0.1):
             won = own(game, name, eps) < NEVER
-            assert won[game.starts & (room > cell)].all()
-            assert not won[game.starts & (room < -cell)].any()
             np.testing.assert_array_equal(won[game.starts], (samples < NEVER)[game.starts])
 
 
 def test_one_way_grazes_under_noise_as_large_as_its_clearance(on_vehicle):
     # It stops turning where it measures y = 0.9 m, and touches the pillar at 0.751 m.
-    game, _ = on_vehicle
+    game = on_vehicle
     start = game.lattice.grid.nearest(np.array([[0.0, 0.5]]))[0]
     assert own(game, "left", 0.1375)[start] < NEVER
     assert own(game, "left", 0.15)[start] > NEVER
@@ -209,7 +186,7 @@ def test_one_way_grazes_under_noise_as_large_as_its_clearance(on_vehicle):
 
 def test_the_sign_rule_loses_where_noise_hides_the_sign_and_nowhere_else(on_vehicle):
     # It can be held in -eps <= y < eps until no way is open, from wherever it comes.
-    game, _ = on_vehicle
+    game = on_vehicle
     y = game.lattice.grid.nodes[:, 1]
     for eps in (0.05, 0.1):
         region = game.starts & game.winnable(eps)
@@ -217,23 +194,20 @@ def test_the_sign_rule_loses_where_noise_hides_the_sign_and_nowhere_else(on_vehi
         lost = own(game, "sign", eps) >= NEVER
         np.testing.assert_array_equal(lost[region], hidden[region])
         assert lost[game.starts & hidden].all()
+        score = game.score("sign", eps)
+        assert score.winnable == region.sum() / game.starts.sum()
+        assert 0 < score.won == score.won_any == 1 - hidden[region].mean() < 1
 
 
 def test_noise_of_less_than_half_a_sample_s_way_cannot_hold_the_sign_rule(on_vehicle):
-    game, _ = on_vehicle
+    game = on_vehicle
     for eps, wins in ((0.025, True), (0.0375, False)):
         region = game.starts & game.winnable(eps)
         assert (own(game, "sign", eps)[region] < NEVER).all() == wins
 
 
-def test_hysteresis_wins_all_that_can_be_won_with_its_own_start_mode(on_vehicle):
-    game, _ = on_vehicle
-    region = game.starts & game.winnable(0.1)
-    assert (own(game, "ideal", 0.1)[region] < NEVER).all()
-
-
 def test_where_nothing_can_be_won_nothing_is_won(on_vehicle, monkeypatch):
-    game, _ = on_vehicle
+    game = on_vehicle
     winnable = game.winnable
     monkeypatch.setattr(game, "winnable", lambda eps: winnable(eps) & (eps < 0.06))
     assert game.score("ideal", 0.05).won == 1
@@ -243,7 +217,7 @@ def test_where_nothing_can_be_won_nothing_is_won(on_vehicle, monkeypatch):
 
 def test_hysteresis_loses_from_the_wrong_start_mode_where_noise_hides_it(on_vehicle):
     # Mode 1 (right) does not let go of y in (0, overlap + eps), and has no room left there.
-    game, _ = on_vehicle
+    game = on_vehicle
     value, at = game.value("ideal", 0.1), game.lattice.grid.nearest(np.array([[0.4, 0.2]]))[0]
     assert value[0, at] < NEVER
     assert value[-1, at] < NEVER
@@ -254,8 +228,8 @@ def test_hysteresis_loses_from_the_wrong_start_mode_where_noise_hides_it(on_vehi
 
 
 def test_every_start_is_won_or_lost_and_no_more_are_won_under_more_noise(on_vehicle):
-    game, controllers = on_vehicle
-    for name in controllers:
+    game = on_vehicle
+    for name in game.controllers:
         # x = 3 m comes some day, and with it the end.
         assert not (game.value(name, 0.1) == NEVER)[:, np.append(game.starts, [True] * 2)].any()
         assert not lasting(game.moves(name, 0.1)).any()
@@ -280,13 +254,13 @@ def some(nodes, mask, n=80):
 def test_the_worst_signal_crashes_lost_starts_in_the_sample_foreseen(
     vehicle, on_vehicle, name, q0, eps
 ):
-    game, controllers = on_vehicle
+    game = on_vehicle
     value = game.value(name, eps)[-1 if q0 is None else q0, :-2]
     at, z0 = some(game.lattice.grid.nodes, game.starts & (value > NEVER))
     signal = worst_signal(game, name, z0, eps, q0)
     assert np.abs(signal.values).max(initial=0.0) <= eps + 1e-12
     assert not signal.values[..., 0].any(), "x is measured without noise"
-    arcs = simulate(vehicle, controllers[name], z0, noise=signal, q0=q0)
+    arcs = simulate(vehicle, game.controllers[name], z0, noise=signal, q0=q0)
     assert {arc.outcome for arc in arcs} == {"crashed"}
     samples = [round(arc.t[-1] / vehicle.dt) for arc in arcs]
     np.testing.assert_array_equal(samples, LOST - value[at])
@@ -301,12 +275,12 @@ def arrivals(task, arcs):
 @pytest.mark.parametrize("kind", ["worst", "adversarial"])
 @pytest.mark.parametrize("name", ["sign off", "ideal"])
 def test_no_noise_makes_a_won_start_of_the_vehicle_fail(vehicle, on_vehicle, name, kind):
-    game, controllers = on_vehicle
+    game = on_vehicle
     eps = 0.1
     value = own(game, name, eps)
     at, z0 = some(game.lattice.grid.nodes, game.starts & (value < NEVER), 60)
     noise = game.worst_noise(name, eps) if kind == "worst" else Noise(kind, eps)
-    arcs = simulate(vehicle, controllers[name], z0, noise=noise)
+    arcs = simulate(vehicle, game.controllers[name], z0, noise=noise)
     assert {arc.outcome for arc in arcs} == {"reached"}
     np.testing.assert_array_equal(arrivals(vehicle, arcs), value[at])
 
@@ -314,22 +288,8 @@ def test_no_noise_makes_a_won_start_of_the_vehicle_fail(vehicle, on_vehicle, nam
 # ---- unit circle: planted controllers
 
 
-def play(circle, controllers, cells=EXACT):
-    return Game(circle, halves(circle), controllers, 0.3, grid=Grid.with_cells(circle.chart, cells))
-
-
-@pytest.fixture(scope="module")
-def on_circle(circle):
-    controllers = {
-        "sign": PolicyController(circle_policy(circle, PI + 0.003)),
-        "hysteresis": circle_controller(circle, 0.4 + 0.003),
-        "homing": homing_controller(circle, 0.4 + 0.003),
-    }
-    return play(circle, controllers), controllers
-
-
 def test_the_sign_rule_is_trapped_where_noise_hides_the_sign_and_nowhere_else(on_circle):
-    game, _ = on_circle
+    game = on_circle
     off, cell = np.abs(game.lattice.grid.nodes[:, 0] - PI - 0.003), game.lattice.grid.cell
     for eps in (0.05, 0.2):
         value = own(game, "sign", eps)
@@ -339,7 +299,7 @@ def test_the_sign_rule_is_trapped_where_noise_hides_the_sign_and_nowhere_else(on
 
 def test_hysteresis_arrives_on_the_circle_in_the_time_foreseen(on_circle):
     # The longest way: in the wrong mode where noise hides that it is wrong, round to the band's near edge.
-    game, _ = on_circle
+    game = on_circle
     for eps in (0.0, 0.2):
         value = game.value("hysteresis", eps)[:, :-2]
         assert (value < NEVER).all()
@@ -350,8 +310,9 @@ def test_hysteresis_arrives_on_the_circle_in_the_time_foreseen(on_circle):
 def test_values_converge_as_the_lattice_gets_finer(circle):
     band, late = [], []
     for cells in (720, 1500, 3000):
-        controllers = {"sign": PolicyController(circle_policy(circle))}
-        game = play(circle, controllers | {"hysteresis": circle_controller(circle)}, cells)
+        rules = {"sign": circle_policy(circle), "hysteresis": circle_controller(circle)}
+        grid = Grid.with_cells(circle.chart, cells)
+        game = Game(circle, halves(circle), rules, 0.3, grid=grid)
         trapped = (own(game, "sign", 0.1) == NEVER).mean() * 2 * PI
         band.append(abs(trapped - 0.2))
         assert band[-1] <= 2 * game.lattice.grid.cell, "one at either edge"
@@ -407,14 +368,14 @@ def test_a_run_that_swings_for_ever_is_held_at_both_ends(circle):
 
 
 def test_the_worst_signal_keeps_trapped_starts_from_arriving(circle, on_circle):
-    game, controllers = on_circle
+    game = on_circle
     eps = 12 * game.lattice.grid.cell
     at = np.flatnonzero(own(game, "sign", eps) == NEVER)
     z0 = game.lattice.grid.nodes[at]
     signal = worst_signal(game, "sign", z0, eps)
     assert len(signal.values) == circle.max_steps
     assert np.abs(signal.values).max() <= eps + 1e-9
-    arcs = simulate(circle, controllers["sign"], z0, noise=signal)
+    arcs = simulate(circle, game.controllers["sign"], z0, noise=signal)
     assert {arc.outcome for arc in arcs} == {"stalled"}
     assert max(np.abs(arc.z - PI).max() for arc in arcs) < 0.2
 
@@ -423,12 +384,12 @@ def test_the_worst_signal_keeps_trapped_starts_from_arriving(circle, on_circle):
     ("name", "kind"), [("sign", "worst"), ("hysteresis", "worst"), ("hysteresis", "adversarial")]
 )
 def test_no_noise_makes_a_won_start_of_the_circle_late(circle, on_circle, name, kind):
-    game, controllers = on_circle
+    game = on_circle
     eps = 12 * game.lattice.grid.cell
     value = own(game, name, eps)
     at, z0 = some(game.lattice.grid.nodes, value < NEVER, 60)
     noise = game.worst_noise(name, eps) if kind == "worst" else Noise(kind, eps)
-    arcs = simulate(circle, controllers[name], z0, noise=noise)
+    arcs = simulate(circle, game.controllers[name], z0, noise=noise)
     assert all(circle.arrived(arc.z).any() for arc in arcs)
     assert (arrivals(circle, arcs) <= value[at]).all()
     if kind == "worst":
@@ -439,7 +400,7 @@ def test_no_noise_makes_a_won_start_of_the_circle_late(circle, on_circle, name, 
 
 
 def test_each_way_past_the_pillar_is_open_as_far_as_geometry_says(on_vehicle):
-    game, _ = on_vehicle
+    game = on_vehicle
     x, y = game.lattice.grid.nodes.T
     for side, samples in zip((1, -1), game.limit.samples, strict=True):
         room, open_ = LAST_CHANCE - x + side * y, samples < NEVER
@@ -451,7 +412,7 @@ def test_each_way_past_the_pillar_is_open_as_far_as_geometry_says(on_vehicle):
 
 
 def test_each_way_round_the_circle_is_open_and_takes_the_time_it_takes(on_circle):
-    game, _ = on_circle
+    game = on_circle
     theta, out = game.lattice.grid.nodes[:, 0], ~game.lattice.arrived
     clockwise, counter = game.limit.samples
     np.testing.assert_array_equal(clockwise[out], np.ceil((theta[out] - 0.3) / 0.05))
@@ -463,7 +424,7 @@ def test_each_way_round_the_circle_is_open_and_takes_the_time_it_takes(on_circle
 
 def test_the_ways_lead_where_they_say(on_vehicle):
     # Following the chosen levels brings each node one sample closer to its end.
-    lattice, limit = on_vehicle[0].lattice, on_vehicle[0].limit
+    lattice, limit = on_vehicle.lattice, on_vehicle.limit
     for samples, level in zip(limit.samples, limit.level, strict=True):
         at = np.flatnonzero((samples < NEVER) & (samples > 0))
         after = lattice.after[level[at], 0, at]
@@ -474,7 +435,7 @@ def test_the_ways_lead_where_they_say(on_vehicle):
 
 
 def test_a_start_is_winnable_if_each_side_that_may_be_measured_is_open(on_vehicle):
-    game, _ = on_vehicle
+    game = on_vehicle
     x, y = game.lattice.grid.nodes.T
     on_axis, masks = game.starts & (np.abs(y) < 1e-9), []
     for eps in BOUNDS:
@@ -493,15 +454,6 @@ def test_a_start_is_winnable_if_each_side_that_may_be_measured_is_open(on_vehicl
         assert more.sum() < less.sum()
 
 
-def test_the_planted_parts_are_those_of_stage_3(vehicle, on_vehicle):
-    game, _ = on_vehicle
-    partition = make_partition(vehicle, sign_policy(vehicle), decisions(vehicle).points, 60)
-    limit = Limit.solve(game.lattice, partition)
-    for eps in (0.0, 0.1):
-        off = limit.winnable(game.bound(eps)) != game.winnable(eps)
-        assert off[game.starts].mean() < 0.02
-
-
 def test_a_single_part_leaves_nothing_to_decide(vehicle):
     partition = make_partition(vehicle, one_way_policy(vehicle), np.empty((0, 2)), 60)
     limit = Limit.solve(Lattice.tabulate(vehicle, Grid.with_cells(vehicle.chart, 120)), partition)
@@ -516,12 +468,12 @@ def test_a_single_part_leaves_nothing_to_decide(vehicle):
 
 @pytest.mark.parametrize("name", ["vehicle", "circle"])
 def test_the_limit_wins_what_is_winnable_and_no_planted_controller_beats_it(name, request):
-    game, controllers = request.getfixturevalue(f"on_{name}")
+    game = request.getfixturevalue(f"on_{name}")
     assert game.score(LIMIT, 0.0).won_any == 1.0
     for eps in (0.05, 0.1):
         limit = game.score(LIMIT, eps)
         assert limit.won == 1.0
-        for loop in controllers:
+        for loop in game.controllers:
             score, value = game.score(loop, eps), game.value(loop, eps)[:, :-2]
             assert score.won_any <= limit.won_any
             assert (value[-1] < NEVER)[game.starts].mean() <= limit.winnable + 1e-12
@@ -530,7 +482,7 @@ def test_the_limit_wins_what_is_winnable_and_no_planted_controller_beats_it(name
 
 
 def test_with_room_for_the_noise_the_limit_holds_the_way_that_it_has_picked(on_circle):
-    game, _ = on_circle
+    game = on_circle
     for eps in (0.05, 0.2):
         moves, places = game.moves(LIMIT, eps), game.lattice.places
         going = np.append(~game.lattice.arrived, [False, False])

@@ -7,13 +7,9 @@ import numpy as np
 import pytest
 from planted import (
     ChartPolicy,
-    circle_controller,
     circle_policy,
     decisions,
     halves,
-    homing_controller,
-    ideal_controller,
-    one_way_policy,
     sign_policy,
 )
 
@@ -51,47 +47,11 @@ def whole_curve():
         yield
 
 
-@pytest.fixture(scope="module")
-def on_vehicle(vehicle):
-    controllers = {
-        "left": PolicyController(one_way_policy(vehicle)),
-        "sign": PolicyController(sign_policy(vehicle)),
-        # The sets end between the nodes, where the plant's rounding errors do not matter.
-        "narrow": ideal_controller(vehicle, 0.104, clear=1.004),
-        "ideal": ideal_controller(vehicle, 0.154, clear=1.004),
-        "grazing": ideal_controller(vehicle, 0.204, clear=0.904),
-    }
-    grid = Grid.with_cells(vehicle.chart, 240)
-    return Game(vehicle, halves(vehicle), controllers, 0.2, grid=grid), controllers
-
-
-@pytest.fixture(scope="module")
-def on_circle(circle):
-    controllers = {
-        "sign": PolicyController(circle_policy(circle)),
-        "hysteresis": circle_controller(circle, 0.4),
-        "homing": homing_controller(circle, 0.4),
-    }
-    grid = Grid.with_cells(circle.chart, EXACT)
-    return Game(circle, halves(circle), controllers, 0.3, grid=grid), controllers
-
-
 # ---- scores
 
 
-@pytest.mark.parametrize("eps", [0.05, 0.1])
-def test_the_sign_rule_s_share_is_what_lies_outside_the_noise(on_vehicle, eps):
-    game, _ = on_vehicle
-    score, y = game.score("sign", eps), game.lattice.grid.nodes[:, 1]
-    region = game.starts & game.winnable(eps)
-    assert score.winnable == region.sum() / game.starts.sum()
-    hidden = (y[region] > -eps - 1e-6) & (y[region] < eps - 1e-6)
-    assert score.won == score.won_any == 1 - hidden.mean()
-    assert 0 < score.won < 1
-
-
 def test_the_ideal_rule_wins_everything_but_the_wrong_start_mode(on_vehicle):
-    score = on_vehicle[0].score("ideal", 0.1)
+    score = on_vehicle.score("ideal", 0.1)
     assert score.won == 1.0
     assert 0.9 < score.won_any < 1.0
     assert score.time == score.time_any == pytest.approx(3.0)
@@ -100,13 +60,13 @@ def test_the_ideal_rule_wins_everything_but_the_wrong_start_mode(on_vehicle):
 
 @pytest.mark.parametrize("eps", [0.0, 0.1, 0.2])
 def test_the_excursion_of_homing_is_the_noise(on_circle, eps):
-    game, _ = on_circle
+    game = on_circle
     cell = game.lattice.grid.cell
     assert eps - cell <= game.score("homing", eps).excursion <= eps + 2 * cell
 
 
 def test_the_excursion_of_a_trapped_policy_is_the_far_side(on_circle):
-    game, _ = on_circle
+    game = on_circle
     assert game.score("sign", 0.1).excursion == pytest.approx(PI, abs=game.lattice.grid.cell)
     assert game.score("sign", 0.1).won == pytest.approx(1 - 0.2 / (2 * PI), abs=2e-3)
 
@@ -130,7 +90,7 @@ def test_noise_on_all_coordinates_is_worse_where_all_matter(vehicle):
 
 
 def test_noise_beyond_what_was_prepared_is_refused(on_vehicle):
-    game, _ = on_vehicle
+    game = on_vehicle
     with pytest.raises(BadInput, match=r"noise 0.25 exceeds the largest bound of this game, 0.2"):
         game.score("sign", 0.25)
 
@@ -210,25 +170,22 @@ def test_what_nobody_reaches_in_time_is_not_winnable(circle):
 @pytest.mark.parametrize("name", ["narrow", "ideal", "grazing"])
 def test_the_margin_of_the_ideal_rule_is_its_overlap_or_its_clearance(on_vehicle, name):
     # Beyond its overlap noise turns a run back that has no room left; the pillar is at 0.751 m.
-    overlap, clear = {"narrow": (0.104, 1.004), "ideal": (0.154, 1.004), "grazing": (0.204, 0.904)}[
-        name
-    ]
-    game, _ = on_vehicle
-    known = min(overlap, clear - 0.751)
+    known = {"narrow": 0.054, "ideal": 0.154, "grazing": 0.904 - 0.751}[name]
+    game = on_vehicle
     assert game.margin(name) == pytest.approx(known, abs=game.lattice.grid.cell)
 
 
 def test_the_margin_of_the_sign_rule_is_half_of_a_sample_s_way(on_vehicle, on_circle):
-    for game, _ in (on_vehicle, on_circle):
+    for game in (on_vehicle, on_circle):
         assert game.margin("sign") == pytest.approx(0.025, abs=game.lattice.grid.cell)
 
 
 def test_there_is_no_margin_where_starts_are_lost_without_noise(on_vehicle):
-    assert on_vehicle[0].margin("left") is None
+    assert on_vehicle.margin("left") is None
 
 
 def test_the_margin_is_no_larger_than_what_was_prepared(on_circle):
-    game, _ = on_circle
+    game = on_circle
     assert game.margin("hysteresis") == pytest.approx(0.3, abs=game.lattice.grid.cell)
     assert game.margin("hysteresis") <= 0.3
 
@@ -237,7 +194,7 @@ def test_the_margin_is_no_larger_than_what_was_prepared(on_circle):
 
 
 def test_the_map_s_classes_are_those_of_the_starts(vehicle, on_vehicle):
-    game, _ = on_vehicle
+    game = on_vehicle
 
     def classes(name, points):
         return game.map(name, 0.1)[game.lattice.grid.nearest(np.array(points))].tolist()
@@ -275,7 +232,7 @@ def test_where_samples_end_between_nodes_a_map_calls_lost_what_is_lost_on_the_pl
 
 
 def test_the_worst_signal_of_several_starts_is_that_of_each_alone(vehicle, on_vehicle):
-    game, _ = on_vehicle
+    game = on_vehicle
     z0 = np.array([[0.0, 0.05], [0.3, -0.05], [0.4, 0.0]])
     together = worst_signal(game, "sign", z0, 0.1)
     for i in range(len(z0)):
@@ -285,19 +242,19 @@ def test_the_worst_signal_of_several_starts_is_that_of_each_alone(vehicle, on_ve
 
 
 def test_a_start_between_the_nodes_is_led_into_the_pillar_too(vehicle, on_vehicle):
-    game, controllers = on_vehicle
+    game = on_vehicle
     x = np.random.default_rng(0).uniform(0.0, 0.4, 50)
     z0 = np.stack([x, np.full_like(x, 0.025)], axis=-1)
     signal = worst_signal(game, "sign", z0, 0.1)
     assert np.abs(signal.values).max() <= 0.1 + 1e-12
-    assert {arc.outcome for arc in simulate(vehicle, controllers["sign"], z0)} == {"reached"}
-    arcs = simulate(vehicle, controllers["sign"], z0, noise=signal)
+    assert {arc.outcome for arc in simulate(vehicle, game.controllers["sign"], z0)} == {"reached"}
+    arcs = simulate(vehicle, game.controllers["sign"], z0, noise=signal)
     assert {arc.outcome for arc in arcs} == {"crashed"}
 
 
 def test_no_milder_noise_crashes_what_the_worst_does_not(vehicle, on_vehicle):
     """Rounding errors of the plant do not let a run escape, although the rule is torn on the axis."""
-    game, controllers = on_vehicle
+    game = on_vehicle
     x, y = np.meshgrid(np.arange(0, 0.31, 0.05), np.linspace(-0.0875, 0.0875, 8))
     z0 = np.stack([x.ravel(), y.ravel()], axis=-1)
     signals = [
@@ -306,7 +263,10 @@ def test_no_milder_noise_crashes_what_the_worst_does_not(vehicle, on_vehicle):
         worst_signal(game, "sign", z0, 0.1),
     ]
     *milder, worst = (
-        [arc.outcome == "crashed" for arc in simulate(vehicle, controllers["sign"], z0, noise=s)]
+        [
+            arc.outcome == "crashed"
+            for arc in simulate(vehicle, game.controllers["sign"], z0, noise=s)
+        ]
         for s in signals
     )
     assert not (np.any(milder, axis=0) & ~np.array(worst)).any()
@@ -315,8 +275,8 @@ def test_no_milder_noise_crashes_what_the_worst_does_not(vehicle, on_vehicle):
 
 
 def test_an_answer_is_settled_unless_it_changes_right_beside_the_node(on_vehicle):
-    answers = on_vehicle[0].answers["sign"]
-    y = on_vehicle[0].lattice.grid.spacing[1] * np.arange(-answers.pad[1], answers.settled.shape[2])
+    answers = on_vehicle.answers["sign"]
+    y = on_vehicle.lattice.grid.spacing[1] * np.arange(-answers.pad[1], answers.settled.shape[2])
     torn = np.unique(np.nonzero(~answers.settled)[2])
     # Where the sides part, and where the pillar is passed and it goes straight on.
     assert set(np.round(y[torn] - 1.5, 4)) == {-0.9, 0.0, 0.9}
@@ -329,11 +289,10 @@ CELLS = {"vehicle": 120, "unit_circle": EXACT}
 
 
 @pytest.fixture(scope="module", params=CELLS)
-def examined(request, vehicle, circle, on_vehicle, on_circle):
-    task, (_, controllers) = {"vehicle": (vehicle, on_vehicle), "unit_circle": (circle, on_circle)}[
-        request.param
-    ]
-    named = {"policy": controllers["sign"], "hyrl": controllers[list(controllers)[-1]]}
+def examined(request, on_vehicle, on_circle):
+    game = {"vehicle": on_vehicle, "unit_circle": on_circle}[request.param]
+    task, named = game.task, {"policy": game.controllers["sign"]}
+    named["hyrl"] = [*game.controllers.values()][-1]
     cells = CELLS[request.param]
     result, maps = worst_case(
         task, decisions(task).points, halves(task), named, (0.05, 0.1), cells=cells
@@ -395,7 +354,7 @@ def test_an_examination_survives_being_written(examined, tmp_path):
 
 
 def test_a_game_refuses_what_it_does_not_know(on_vehicle):
-    game = next(part for part in on_vehicle if isinstance(part, Game))
+    game = on_vehicle
     with pytest.raises(BadInput, match="unknown controller 'mine'"):
         game.score("mine", 0.1)
     for eps in (-0.1, float("nan")):
