@@ -328,17 +328,6 @@ def test_rules_stay_within_the_bound_of_each_column(vehicle, shares, candidates,
     assert np.isin(rules.own, rules.common).sum() == 0
 
 
-def test_the_rules_of_all_controllers_are_the_same_but_for_modes(vehicle):
-    one, several = (
-        Rules(vehicle, loop, EPS, np.array([0.0, 1.0]), 40)
-        for loop in (PolicyController(sign_policy(vehicle)), Lock())
-    )
-    kinds = [[rules.all[number].kind for number in rules.common] for rules in (one, several)]
-    assert kinds[0] == kinds[1]
-    assert len(one.own) == 0
-    assert {several.all[number].kind for number in several.own} == {"jump", "stay", "turn"}
-
-
 def test_rules_are_held_for_their_segments(vehicle):
     loop = PolicyController(one_way_policy(vehicle))
     rules = Rules(vehicle, loop, EPS, np.array([0.0, 1.0]))

@@ -49,17 +49,6 @@ def test_a_critical_angle_on_the_circle(search, circle, angle):
     assert critical.resolution == pytest.approx(2 * PI / 120 / 32)
 
 
-@pytest.mark.slow
-def test_a_finer_resolution_gives_a_smaller_error(search, circle):
-    angles, shares = (2.345, 3.3), (1 / 2, 1 / 16)
-    errors = np.zeros((len(angles), len(shares)))
-    for (i, j), _ in np.ndenumerate(errors):
-        found = search(circle, circle_policy(circle, angles[i]), 60, shares[j])
-        errors[i, j] = np.abs(found.points - angles[i]).max()
-    coarse, fine = errors.max(axis=0)
-    assert fine < coarse / 4
-
-
 def test_two_critical_angles_are_two_pieces(search, circle):
     policy = two_way_circle_policy(circle, 2.0, 3.0, 4.0)
     critical = search(circle, policy, 120, RESOLUTION)
@@ -109,15 +98,6 @@ def test_a_slanted_critical_line(search, vehicle):
 
 
 # ---- three dimensions and more
-
-
-def test_a_critical_plane(search):
-    cube, share = Cube(heights), 1 / 8
-    policy = plane_policy(cube, NORMAL, lambda s: np.where(s >= 0.2, 1.0, -1.0))
-    critical = search(cube, policy, 10, share)
-    assert critical.pieces == 1
-    assert len(critical.points) > 100
-    assert np.abs(heights(critical.points) - 0.2).max() <= share * critical.spacing
 
 
 @pytest.mark.parametrize(

@@ -164,13 +164,6 @@ def vehicle_low(certificate):
 
 
 @pytest.mark.long
-def test_threads_change_nothing(certificate, loops, scores, monkeypatch):
-    several = examination._replays(certificate, scores)
-    monkeypatch.setattr(examination, "THREADS", 1)
-    assert examination._replays(certificate, scores) == several
-
-
-@pytest.mark.long
 @pytest.mark.slow
 def test_a_run_of_which_too_much_is_proved_says_so_everywhere(
     planted_circle, tmp_path, monkeypatch, capsys

@@ -72,14 +72,8 @@ def case(request):
 
 def test_signed_distance_is_right_to_a_cell(case):
     chart, shape = case
-    for cells in (50, 100):
+    for cells in (20, 60, 240):
         assert worst_error(chart, shape, cells) <= 1.5 * Grid.with_cells(chart, cells).cell
-
-
-def test_its_error_shrinks_with_the_grid(case):
-    chart, shape = case
-    coarse, fine = (worst_error(chart, shape, cells) for cells in (20, 240))
-    assert fine < coarse / 6
 
 
 def test_contains_is_a_distance_of_at_most_zero(case):
@@ -139,12 +133,6 @@ def test_dilation_and_erosion_move_the_boundary_by_their_amount():
     np.testing.assert_array_equal(whole.eroded(0.2).contains(z), [True, False, False, False])
 
 
-def test_dilation_runs_over_the_seam():
-    whole = on_grid(RING, arc, 360).dilated(0.3)
-    angles = np.array([[0.2 + 1.05], [0.2 + 1.15], [0.2 - 1.05], [0.2 - 1.15], [2 * PI - 0.01]])
-    np.testing.assert_array_equal(whole.contains(angles), [True, False, True, False, True])
-
-
 def test_complement_shares_the_boundary_and_nothing_else():
     grid = Grid.with_cells(LINE, 4)
     whole = GridSet(grid, np.array([-1.0, -0.5, 0.0, 0.5, 1.0]))
@@ -159,18 +147,6 @@ def test_everything():
     assert Everything().contains(z).all()
     assert (Everything().signed_distance(z) < -1e9).all()
     assert not Complement(Everything()).contains(z).any()
-
-
-# ---- periods
-
-
-def test_any_winding_is_the_same_point(case):
-    chart, shape = case
-    whole, z = on_grid(chart, shape, 40), points(chart)
-    distance = whole.signed_distance(z)
-    turns = np.where(chart.periodic, 6 * PI, 0.0)
-    for shifted in (z + turns, z - turns):
-        np.testing.assert_allclose(whole.signed_distance(shifted), distance, atol=1e-9)
 
 
 # ---- grids
@@ -205,15 +181,6 @@ def test_the_edge_lies_half_way_between_nodes_of_long_cells():
         z = np.full((2, 2), 0.5)
         z[:, axis] = middle - 1e-3, middle + 1e-3
         np.testing.assert_array_equal(part.contains(z), [True, False])
-
-
-def test_interpolation_is_exact_for_linear_functions():
-    grid, z = Grid.with_cells(PLANE, 12), points(PLANE)
-    slopes = np.array([2.0, -3.0])
-    values = grid.nodes @ slopes + 1
-    np.testing.assert_allclose(grid.interpolate(values, z), z @ slopes + 1, atol=1e-9)
-    outside = np.array([[9.0, 0.0], [0.0, -9.0]])
-    np.testing.assert_allclose(grid.interpolate(values, outside), [5.0, 4.0], atol=1e-9)
 
 
 def interpolated_in_turn(whole, point):

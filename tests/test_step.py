@@ -129,22 +129,6 @@ def test_a_step_gives_what_a_plain_one_gives(controller, task):
     assert len(np.unique(u)) > 1
 
 
-def test_on_the_edge_itself_it_flows(controller):
-    for q in controller.modes:
-        nodes, values = controller.flow_sets[q].grid.nodes, controller.flow_sets[q].values
-        _, after = controller.step(np.full(len(nodes), q), nodes)
-        assert (values == 0).any()
-        np.testing.assert_array_equal(after == q, values <= 0)
-
-
-def test_the_sets_do_not_depend_on_the_batch(controller, task):
-    z = random_states(task, 400, np.random.default_rng(1))
-    q = np.random.default_rng(1).choice(controller.modes, len(z))
-    _, after = controller.step(q, z)
-    singles = [controller.step(q[i : i + 1], z[i : i + 1])[1][0] for i in range(len(z))]
-    np.testing.assert_array_equal(after, singles)
-
-
 # ---- what it does not do
 
 

@@ -45,9 +45,6 @@ from hyrl_mj.system import cores
 from hyrl_mj.system.progress import progress_bar
 from hyrl_mj.tasks import Task
 
-# Games that are solved at the same time; each takes tens of megabytes.
-THREADS = 4
-
 
 def worst_case(
     task: Task,
@@ -299,7 +296,7 @@ def _in_threads(
     label: str, work: Callable[..., Any], calls: Sequence[tuple[Any, ...]]
 ) -> dict[tuple[Any, ...], Any]:
     """Returns what calls give by their arguments, from threads: NumPy releases the interpreter's lock."""
-    threads = min(THREADS, cores.count())
+    threads = min(4, cores.count())  # each game takes tens of megabytes
     # One limit for all threads: those within would undo each other's.
     with BLAS.limit(limits=1, user_api="blas"), ThreadPoolExecutor(threads) as pool:
         results = pool.map(lambda call: work(*call), calls)
