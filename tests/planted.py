@@ -115,7 +115,7 @@ def few_noises(patch):
     noises = replays._noises
 
     def few(*arguments):
-        return {k: v for k, v in noises(*arguments).items() if k in ("none", "alternating")}
+        return [noise for noise in noises(*arguments) if noise.kind in ("none", "alternating")]
 
     patch.setattr(replays, "_noises", few)
     patch.setattr(examination, "usual_kinds", lambda *_: ("none", "uniform"))

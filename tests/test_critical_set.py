@@ -131,24 +131,6 @@ def test_two_critical_planes_are_two_pieces(search):
 # ---- both searches
 
 
-def test_both_agree_on_the_papers_problems(task):
-    policy = sign_policy(task) if task.name == "vehicle" else circle_policy(task, 3.0)
-    rods, outcome = (find_critical_set(task, policy, 60, RESOLUTION, m) for m in SEARCHES)
-    assert rods.pieces == outcome.pieces == 1
-    both = rods.resolution / 2 + outcome.resolution / 2
-    off = [
-        np.abs(found.points[:, -1] - (0 if task.name == "vehicle" else 3))
-        for found in (rods, outcome)
-    ]
-    assert max(off[0].max(), off[1].max()) <= both
-    low, high = np.array(
-        [[f.points.min(axis=0), f.points.max(axis=0)] for f in (rods, outcome)]
-    ).swapaxes(0, 1)
-    assert np.abs(np.diff(low, axis=0)).max() <= both
-    # Where M* ends before the obstacle, the last point is one of the grid's.
-    assert np.abs(np.diff(high, axis=0)).max() <= rods.spacing
-
-
 def test_an_unknown_method_is_refused(circle):
     with pytest.raises(BadInput, match=r"'guess'.*rods, outcome"):
         find_critical_set(circle, circle_policy(circle), 60, RESOLUTION, "guess")

@@ -147,7 +147,7 @@ def test_starts_lie_in_what_is_proved_in_every_mode_and_at_its_border(certificat
             for step in ((0, 1), (0, -1), (1, 0), (-1, 0))
         ]
         assert np.any(beside, axis=0).mean() > 0.2
-    firsts = {b.kind: b for b in reversed(batches)}
+    firsts = {b.noise.kind: b for b in reversed(batches)}
     assert all(b.steps is None and len(set(b.q0)) == 3 for b in firsts.values())
     others = [b for b in batches if b.steps is not None]
     assert others

@@ -58,13 +58,6 @@ def test_the_ideal_rule_wins_everything_but_the_wrong_start_mode(on_vehicle):
     assert score.excursion is None, "every run is over some day"
 
 
-@pytest.mark.parametrize("eps", [0.0, 0.1, 0.2])
-def test_the_excursion_of_homing_is_the_noise(on_circle, eps):
-    game = on_circle
-    cell = game.lattice.grid.cell
-    assert eps - cell <= game.score("homing", eps).excursion <= eps + 2 * cell
-
-
 def test_the_excursion_of_a_trapped_policy_is_the_far_side(on_circle):
     game = on_circle
     assert game.score("sign", 0.1).excursion == pytest.approx(PI, abs=game.lattice.grid.cell)

@@ -76,17 +76,6 @@ def test_signed_distance_is_right_to_a_cell(case):
         assert worst_error(chart, shape, cells) <= 1.5 * Grid.with_cells(chart, cells).cell
 
 
-def test_contains_is_a_distance_of_at_most_zero(case):
-    chart, shape = case
-    z = points(chart)
-    whole = on_grid(chart, shape, 60)
-    inside = whole.contains(z)
-    np.testing.assert_array_equal(inside, whole.signed_distance(z) <= 0)
-    clear = np.abs(shape(z)) > 1.5 * whole.grid.cell
-    np.testing.assert_array_equal(inside[clear], shape(z[clear]) <= 0)
-    np.testing.assert_array_equal(whole.mask, whole.contains(whole.grid.nodes))
-
-
 def test_a_full_and_an_empty_set(case):
     chart, _ = case
     grid, z = Grid.with_cells(chart, 20), points(chart)

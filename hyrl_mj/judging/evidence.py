@@ -33,22 +33,19 @@ class Sample:
     """What was won of some episodes, or attacked starts.
 
     Attributes:
-        kind: the kind of noise.
+        kind: the kind of noise, or "attack" of starts that were attacked.
         won, total: how many were won, and of how many.
-        attack: whether they are starts that were attacked.
         least: the fewest that HELD needs.
     """
 
     kind: str
     won: int
     total: int
-    attack: bool
     least: int
 
     def __str__(self) -> str:
-        what = "attacked starts" if self.attack else f"episodes under {self.kind} noise"
-        if self.kind == NO_NOISE:
-            what = "episodes without noise"
+        others = {"attack": "attacked starts", NO_NOISE: "episodes without noise"}
+        what = others.get(self.kind, f"episodes under {self.kind} noise")
         return f"{self.won:,} of {self.total:,} {what}"
 
     @property

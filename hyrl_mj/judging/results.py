@@ -9,8 +9,8 @@ import numpy as np
 
 from hyrl_mj.files import artifacts
 from hyrl_mj.judging.game import NEARLY
-from hyrl_mj.policies import Policy, PolicyController
-from hyrl_mj.simulation import LoopSettings, Rollout, closed_loop, simulate
+from hyrl_mj.policies import Policy
+from hyrl_mj.simulation import Rollout, policy_runs, simulate
 from hyrl_mj.tasks import Outcome, Task
 
 # Number of episodes from which arrivals are counted.
@@ -95,8 +95,9 @@ class Failures:
 def _episodes(task: Task, policy: Policy, record: bool = False) -> Rollout:
     """Plays a policy from starts of the task, which are the same each time."""
     starts = task.starts(EPISODES, np.random.default_rng(0))
-    settings = LoopSettings(record=record, states=False, vary=True, label="arrivals")
-    return closed_loop(task, PolicyController(policy), starts, settings=settings)
+    return policy_runs(
+        task, policy, starts, record=record, states=False, vary=True, label="arrivals"
+    )
 
 
 # What the policy of a mode is.

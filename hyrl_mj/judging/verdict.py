@@ -245,7 +245,7 @@ class _Case:
         for sample in samples:
             if not sample.held:
                 words.append(str(sample))
-                if sample.attack:
+                if sample.kind == "attack":
                     starts = max(starts, sample.enough)
                 else:
                     episodes = max(episodes, sample.enough)
@@ -262,14 +262,14 @@ class _Case:
         """What HELD rests on: episodes without noise and of each kind of noise, and attacked starts."""
         counts, s, found = by_kind(self.robustness, "hyrl"), self.settings, self.robustness
         samples = [
-            Sample(kind, *counts.get(kind, (0, 0)), False, s.episodes)
+            Sample(kind, *counts.get(kind, (0, 0)), s.episodes)
             for kind in dict.fromkeys(
                 (*usual_kinds(self.task, found.eps, found.everywhere), *counts)
             )
         ]
         attacks = [c for c in self.robustness.attacks if c.controller == "hyrl"]
         won, total = next(((c.attacked - c.lost, c.attacked) for c in attacks), (0, 0))
-        return [*samples, Sample("attack", won, total, True, s.attacked)]
+        return [*samples, Sample("attack", won, total, s.attacked)]
 
     @property
     def fair(self) -> bool:

@@ -13,7 +13,6 @@ from hyrl_mj.errors import BadInput
 from hyrl_mj.judging.game.resolution import (
     LATTICE,
     MOST_TRANSITIONS,
-    lattice_grid,
     level_counts,
     probed_hops,
     resolves,
@@ -146,15 +145,14 @@ class Lattice(Places):
         return Lattice.why_estimate(task) is None and Lattice.why_not(task, grid) is None
 
     @staticmethod
-    def tabulate(task: Task, grid: Grid | None = None) -> Lattice:
-        """Returns the lattice of a task, by default the finest: 12,000 cells along a line, 480 in the plane.
+    def tabulate(task: Task, grid: Grid) -> Lattice:
+        """Returns the lattice of a task on the nodes of a grid.
 
         Raises:
             BadInput: the plant's state is more than the chart, or the chart has more than three dimensions,
                 or the lattice is too coarse, or too fine for the memory.
         """
         Lattice.check(task)
-        grid = grid or lattice_grid(task)
         nodes = grid.nodes
         measurement = task.placed(nodes).measurement
         ending, failed = task.ending(measurement), task.failed(measurement)

@@ -49,7 +49,6 @@ class Batch:
 
     Attributes:
         noise: the noise.
-        kind: its kind.
         z0: (n, d) chart points.
         q0: (n,) modes at the start, `NOT_STARTED` where the controller picks it.
         seed: seed of the noise.
@@ -58,7 +57,6 @@ class Batch:
     """
 
     noise: AnyNoise
-    kind: str
     z0: np.ndarray
     q0: np.ndarray
     seed: int
@@ -88,20 +86,20 @@ def replay(certificate: Certificate, name: str, score: Score) -> ReplayCount | N
     # A tenth of the starts is played where so little is proved that no word follows from it.
     few = 1 if nearly or whole else 10
     batches = batches_of(certificate, name, score.eps, of, few)
-    starts, lost = ({batch.kind: 0 for batch in batches} for _ in range(2))
+    starts, lost = ({batch.noise.kind: 0 for batch in batches} for _ in range(2))
     judged, first = 0, None
     # One after the other: the physics takes all cores, and the rest holds the interpreter's lock.
     for batch in progress_bar(batches, "replays", "games"):
         run, again = play(game.task, certificate.controllers[name], batch)
         losing = np.flatnonzero(run.outcome != Outcome.REACHED)
-        starts[batch.kind] += len(run.outcome)
-        lost[batch.kind] += len(losing)
+        starts[batch.noise.kind] += len(run.outcome)
+        lost[batch.noise.kind] += len(losing)
         judged += again
         if first is None and len(losing):
             at = losing[0]
             mode = None if batch.q0[at] == NOT_STARTED else int(batch.q0[at])
             outcome = Outcome(run.outcome[at]).label
-            first = LostReplay(tuple(map(float, batch.z0[at])), mode, batch.kind, outcome)
+            first = LostReplay(tuple(map(float, batch.z0[at])), mode, batch.noise.kind, outcome)
     return ReplayCount(name, score.eps, game.everywhere, of, starts, lost, judged, first)
 
 
@@ -115,13 +113,13 @@ def batches_of(
     """
     rng, pools = np.random.default_rng(0), _pools(certificate, name, eps, of)
     batches = []
-    for kind, noise in _noises(certificate, name, eps).items():
-        z0, q0, samples = _drawn(pools, STARTS[kind] // few, rng)
+    for noise in _noises(certificate, name, eps):
+        z0, q0, samples = _drawn(pools, STARTS[noise.kind] // few, rng)
         for first in (0, *range(WHOLE, len(z0), BATCH)):
             part = slice(first, first + BATCH if first else WHOLE)
             number = int(rng.integers(2**31))
             steps = samples[part] if first else None
-            batches.append(Batch(noise, kind, z0[part], q0[part], number, steps))
+            batches.append(Batch(noise, z0[part], q0[part], number, steps))
     return batches
 
 
@@ -148,15 +146,15 @@ def play(task: Task, controller: Controller, batch: Batch) -> tuple[Rollout, int
     return run, int(judged.sum())
 
 
-def _noises(certificate: Certificate, name: str, eps: float) -> dict[str, AnyNoise]:
-    """Returns the noise signals that are known, the strongest last, by kind."""
+def _noises(certificate: Certificate, name: str, eps: float) -> list[AnyNoise]:
+    """Returns the noise signals that are known, the strongest last."""
     game = certificate.game
-    simple = {kind: Noise(kind, eps, game.everywhere) for kind in ("uniform", "alternating")}
-    noises: dict[str, AnyNoise] = {"none": Noise(), **simple, "worst": game.worst_noise(name, eps)}
+    simple = (Noise(kind, eps, game.everywhere) for kind in ("uniform", "alternating"))
+    noises: list[AnyNoise] = [Noise(), *simple, game.worst_noise(name, eps)]
     if covers_sensor(game.task, eps):
-        noises[SENSOR] = Noise(SENSOR)
+        noises.append(Noise(SENSOR))
     if name in certificate.answers:
-        noises["cells"] = CellNoise(certificate, name, eps)
+        noises.append(CellNoise(certificate, name, eps))
     return noises
 
 
