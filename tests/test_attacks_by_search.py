@@ -21,7 +21,7 @@ from hyrl_mj.judging.attack_search import Search, Waves
 from hyrl_mj.judging.attacks import Budget, attack, attack_starts
 from hyrl_mj.judging.episodes import Regions
 from hyrl_mj.judging.examination import ExamineOptions
-from hyrl_mj.judging.game import NEVER, Game
+from hyrl_mj.judging.game import NEVER
 from hyrl_mj.learning.presets import preset
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.policies.hybrid import HybridController
@@ -67,10 +67,8 @@ def on(task, controller, starts, rounds=2, **options):
 # ---- what is found
 
 
-def test_all_that_the_game_loses_is_lost_and_nothing_that_is_won_by_far(vehicle):
-    sign = PolicyController(sign_policy(vehicle))
-    grid = Grid.with_cells(vehicle.chart, 120)
-    game = Game(vehicle, halves(vehicle), {"sign": sign}, 0.2, grid=grid)
+def test_all_that_the_game_loses_is_lost_and_nothing_that_is_won_by_far(vehicle, on_vehicle):
+    game, sign = on_vehicle, on_vehicle.controllers["sign"]
     nodes = game.lattice.grid.nodes[game.starts]
     lost = game.value("sign", EPS)[-1, :-2][game.starts] >= NEVER
     rng = np.random.default_rng(0)

@@ -4,26 +4,12 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from planted import decisions, halves, ideal_controller, one_way_policy, sign_policy
+from planted import decisions
 
 from hyrl_mj import BadInput, Noise
 from hyrl_mj.judging import episodes as bulk
 from hyrl_mj.judging.episodes import Regions, noisy_episodes
 from hyrl_mj.judging.game import Ends, compare
-from hyrl_mj.judging.game.scores import Game
-from hyrl_mj.policies.controllers import PolicyController
-from hyrl_mj.sets import Grid
-
-
-@pytest.fixture(scope="module")
-def on_vehicle(vehicle):
-    controllers = {
-        "left": PolicyController(one_way_policy(vehicle)),
-        "sign": PolicyController(sign_policy(vehicle)),
-        "ideal": ideal_controller(vehicle, 0.154, clear=1.004),
-    }
-    grid = Grid.with_cells(vehicle.chart, 120)
-    return Game(vehicle, halves(vehicle), controllers, 0.2, grid=grid), controllers
 
 
 def record(records, controller, region, noise=None):
@@ -39,10 +25,10 @@ def record(records, controller, region, noise=None):
 @pytest.fixture(scope="module")
 def records(vehicle, on_vehicle):
     """Episodes of the sign rule and of the ideal one, under every kind of noise."""
-    game, controllers = on_vehicle
+    game = on_vehicle
     noises = tuple(Noise(k, 0.1) for k in ("uniform", "alternating", "adversarial"))
     regions = Regions(decisions(vehicle).points, (game.lattice.grid, game.winnable(0.1)))
-    loops = {name: controllers[name] for name in ("sign", "ideal")}
+    loops = {name: game.controllers[name] for name in ("sign", "ideal")}
     return noisy_episodes(vehicle, regions, loops, noises, 300)[0]
 
 
@@ -92,7 +78,7 @@ def test_adversarial_noise_is_worse_than_chance(records):
 
 def test_no_noise_is_worse_than_the_worst(records, on_vehicle):
     # The share of starts in the band that the game calls lost bounds what episodes lose near M*.
-    won = on_vehicle[0].score("sign", 0.1).won
+    won = on_vehicle.score("sign", 0.1).won
     for kind in ("uniform", "alternating", "adversarial"):
         mine = [record(records, "sign", region, kind) for region in ("near M*", "elsewhere")]
         lost = sum(r.episodes - r.outcomes["reached"] for r in mine)
@@ -100,7 +86,7 @@ def test_no_noise_is_worse_than_the_worst(records, on_vehicle):
 
 
 def test_the_same_seed_gives_the_same_counts(vehicle, on_vehicle):
-    sign = {"sign": on_vehicle[1]["sign"]}
+    sign = {"sign": on_vehicle.controllers["sign"]}
 
     def counts(seed):
         noises = (Noise("uniform", 0.2),)
@@ -114,7 +100,7 @@ def test_the_same_seed_gives_the_same_counts(vehicle, on_vehicle):
 
 def test_batches_add_up_and_none_is_the_same(vehicle, on_vehicle, monkeypatch):
     monkeypatch.setattr(bulk, "BATCH", 50)
-    sign, noises = {"sign": on_vehicle[1]["sign"]}, (Noise("uniform", 0.1),)
+    sign, noises = {"sign": on_vehicle.controllers["sign"]}, (Noise("uniform", 0.1),)
 
     def near(count):
         regions = Regions(decisions(vehicle).points)
@@ -128,13 +114,13 @@ def test_batches_add_up_and_none_is_the_same(vehicle, on_vehicle, monkeypatch):
 
 
 def test_noise_that_hides_everything_is_refused(vehicle, on_vehicle):
-    sign, noises = {"sign": on_vehicle[1]["sign"]}, (Noise("uniform", 1.5),)
+    sign, noises = {"sign": on_vehicle.controllers["sign"]}, (Noise("uniform", 1.5),)
     with pytest.raises(BadInput, match=r"noise bound 1\.5 hides the whole state space of vehicle"):
         noisy_episodes(vehicle, Regions(decisions(vehicle).points), sign, noises, 10)
 
 
 def test_controllers_are_compared_from_starts_that_all_win_without_noise(vehicle, on_vehicle):
-    loops = {name: on_vehicle[1][name] for name in ("sign", "left")}
+    loops = {name: on_vehicle.controllers[name] for name in ("sign", "left")}
     noises = (Noise("none", 0.1), Noise("adversarial", 0.1))
     counts, (compared,) = noisy_episodes(
         vehicle, Regions(decisions(vehicle).points), loops, noises, 60
