@@ -1,5 +1,7 @@
 """The hybrid controller jumps exactly on its jump set, and is a pure function."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 from drawn import points
@@ -80,6 +82,34 @@ def test_a_single_mode_never_jumps(vehicle):
         np.testing.assert_array_equal(q, 0)
         np.testing.assert_array_equal(u, 0.5)
         np.testing.assert_array_equal(controller.initial_mode(z), 0)
+
+
+@dataclass(frozen=True)
+class Counted:
+    """A set that is the half line z >= 0 or z <= 0, and counts the points that it is asked about."""
+
+    sign: float
+    asked: list
+
+    def signed_distance(self, z):
+        self.asked.append(len(z))
+        return self.sign * z[:, 0]
+
+
+def test_other_sets_are_asked_only_where_there_is_a_choice(circle):
+    sets = {q: Counted(sign, []) for q, sign in ((0, 1.0), (1, -1.0), (2, -2.0))}
+    z = np.array([[-1.0], [-0.5], [1.0], [2.0], [3.0]])
+
+    def asked(modes, q):
+        for counted in sets.values():
+            counted.asked.clear()
+        policies = dict.fromkeys(modes, constant(circle, 0.0))
+        _, after = HybridController(circle, policies, {m: sets[m] for m in modes}).step(q, z)
+        return after.tolist(), [sum(sets[m].asked) for m in modes]
+
+    assert asked((0, 1), np.zeros(5, dtype=int)) == ([0, 0, 1, 1, 1], [5, 0])
+    assert asked((0, 1, 2), np.zeros(5, dtype=int)) == ([0, 0, 2, 2, 2], [5, 3, 3])
+    assert asked((0, 1, 2), np.array([0, 1, 1, 2, 2])) == ([0, 0, 1, 2, 2], [2, 2, 3])
 
 
 # ---- a pure function
