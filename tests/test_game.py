@@ -376,15 +376,6 @@ def test_each_way_round_the_circle_is_open_and_takes_the_time_it_takes(on_circle
         assert game.winnable(eps).all()
 
 
-def test_the_ways_lead_where_they_say(on_vehicle):
-    # Following the chosen levels brings each node one sample closer to its end.
-    lattice, limit = on_vehicle.lattice, on_vehicle.limit
-    for samples, level in zip(limit.samples, limit.level, strict=True):
-        at = np.flatnonzero((samples < NEVER) & (samples > 0))
-        after = lattice.after[level[at], 0, at]
-        np.testing.assert_array_equal(np.append(samples, [0, NEVER])[after], samples[at] - 1)
-
-
 # ---- the limit: what can be won
 
 

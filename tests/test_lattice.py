@@ -44,19 +44,6 @@ def some_moves(lattice, n=3000):
 # ---- vehicle: from node to node
 
 
-def test_every_sample_of_the_vehicle_leads_where_the_plant_goes(vehicle, lattices):
-    lattice = lattices[240]
-    assert lattice.exact
-    level, node = some_moves(lattice)
-    ends, after = stepped(lattice, level, node), lattice.after[level, 0, node]
-    ending = vehicle.ending(ends)
-    on = ending == Outcome.RUNNING
-    np.testing.assert_allclose(lattice.grid.nodes[after[on]], ends[on], atol=1e-6)
-    np.testing.assert_array_equal(after[ending == Outcome.REACHED], lattice.nodes)
-    np.testing.assert_array_equal(after[~on & (ending != Outcome.REACHED)], lattice.nodes + 1)
-    assert len(np.unique(ending)) >= 3, "the samples end in every way"
-
-
 def test_nodes_of_the_vehicle_have_arrived_on_the_line_and_failed_where_it_crashes(
     vehicle, lattices
 ):
@@ -69,20 +56,6 @@ def test_nodes_of_the_vehicle_have_arrived_on_the_line_and_failed_where_it_crash
 
 def test_the_levels_of_a_discrete_task_are_its_own(vehicle, lattices):
     np.testing.assert_array_equal(lattices[240].levels, vehicle.input_levels)
-
-
-def test_between_nodes_a_sample_leads_to_those_around_its_end(lattices):
-    lattice = lattices[60]
-    assert not lattice.exact
-    level, node = some_moves(lattice)
-    after = lattice.after[level, :, node]
-    on = (after < lattice.nodes).all(axis=1)
-    offset = lattice.grid.nodes[after[on]] - stepped(lattice, level, node)[on][:, None]
-    half = np.abs(lattice.levels[level[on], 0]) == 0.5
-    np.testing.assert_allclose(offset[~half], 0, atol=1e-6)
-    np.testing.assert_allclose(np.abs(offset[half, :, 1]), 0.025, atol=1e-6)
-    np.testing.assert_allclose(offset[half].sum(axis=1), 0, atol=1e-6)
-    assert half.any()
 
 
 def test_leaving_the_chart_is_a_failure(vehicle):

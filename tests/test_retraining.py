@@ -30,7 +30,7 @@ from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.simulation import KINDS
 from hyrl_mj.stages.extended_sets import extend
 from hyrl_mj.stages.grounds import ByEpisodes, ByGame, Episodes, Judged, mode_ground
-from hyrl_mj.stages.retraining import retrain, with_later_images
+from hyrl_mj.stages.retraining import mirror_image, retrain, with_later_images
 
 # ---- where modes are trained
 
@@ -275,15 +275,11 @@ def test_a_mode_trained_in_vain_takes_the_image_of_a_later_one(
     assert with_later_images([last, (vain, spent)], grounds, quick)[1] == (vain, spent)
 
 
-@pytest.mark.slow
 def test_one_that_will_not_do_is_not_taken(vehicle, vehicle_sets, quick):
-    # An untrained policy drives into the pillar.
-    other = untrained(vehicle, quick)
-    assert mode_ground(vehicle, vehicle_sets, 1)(symmetry.mirrored(other)) < (0.0, -1.0)
-    alone, _ = retrain(mode_ground(vehicle, vehicle_sets, 1), quick, seed=0)
-    found, _ = retrain(mode_ground(vehicle, vehicle_sets, 1), quick, seed=0, others=[(other, HALF)])
-    for name, weight in alone.weights.items():
-        np.testing.assert_array_equal(found.weights[name], weight)
+    other = untrained(vehicle, quick)  # it drives into the pillar
+    ground = mode_ground(vehicle, vehicle_sets, 1)
+    assert ground(symmetry.mirrored(other)) < (0.0, -1.0)
+    assert mirror_image(ground, [(other, HALF)]) is None
 
 
 # ---- where the worst case cannot be played
