@@ -7,8 +7,7 @@ import pytest
 from planted import ChartPolicy, halves
 from planted_field import Field
 
-import hyrl_mj
-from hyrl_mj import BadInput, Chart, Partition, extend, find_critical_set, make_partition
+from hyrl_mj import BadInput, Chart, extend, find_critical_set, make_partition
 from hyrl_mj.sets import distance_to
 from hyrl_mj.tasks import check_task
 
@@ -171,16 +170,6 @@ def test_rare_ways_and_names_that_no_run_shows_are_said(vehicle, monkeypatch):
     assert partition.sentence(vehicle).endswith("; no run that arrives goes 2 (below)")
     rare = replace(partition, dropped=(2,))
     assert rare.sentence(vehicle).endswith("; less than 1% goes 2 (below): no mode")
-
-
-def test_rare_ways_are_kept_with_the_parts(tmp_path):
-    field = Field(ROW)
-    grid = halves(hyrl_mj.get_task("vehicle"), 8).parts[0]
-    partition = Partition((0, 3), (grid, grid), grid.mask, (1,))
-    partition.save(tmp_path / "parts.npz")
-    back = Partition.load(tmp_path / "parts.npz", hyrl_mj.get_task("vehicle"))
-    assert back.dropped == (1,)
-    assert back.sentence(field).endswith("less than 1% goes 1 (right of a, left of b): no mode")
 
 
 # ---- what is wrong with a task
