@@ -86,7 +86,7 @@ class Grid:
     @cached_property
     def nodes(self) -> np.ndarray:
         """All nodes (N, d); the last coordinate varies fastest."""
-        index = np.moveaxis(np.indices(self.counts), 0, -1).reshape(-1, len(self.counts))
+        index = np.stack([*np.indices(self.counts)], axis=-1).reshape(-1, len(self.counts))
         return self.chart.origin + self.spacing * index
 
     @cached_property

@@ -63,7 +63,7 @@ class Answers:
             )
         grid, modes = lattice.grid, controller.modes
         pad = np.where(grid.chart.periodic, 0, nodes_within(lattice, bound))
-        index = np.moveaxis(np.indices(tuple(grid.counts + 2 * pad)), 0, -1) - pad
+        index = np.stack([*np.indices(tuple(grid.counts + 2 * pad))], axis=-1) - pad
         measured = grid.chart.origin + grid.spacing * index
 
         def answer(q: int | None, points: np.ndarray) -> np.ndarray:

@@ -104,7 +104,7 @@ class Cells(Places):
         bias = Sensor.parse(task.sensor).bounds(task)[1] / h if task.sensor else 0.0
         reach = np.ceil(np.abs(cells).max(axis=0) + 1 + bias).astype(int)
         margin = np.where(periodic, 0, reach)
-        index = np.moveaxis(np.indices(tuple(counts + 2 * margin)), 0, -1) - margin
+        index = np.stack([*np.indices(tuple(counts + 2 * margin))], axis=-1) - margin
         centre, half = grid.chart.low + h * (index.reshape(-1, len(h)) + 0.5), h / 2 + slack
         fails, ends, success = _ends(task, Affine.box(centre, half))
         # Beyond the chart the episode has to end as a success now, or after whatever comes next.
