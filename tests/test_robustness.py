@@ -173,10 +173,6 @@ def test_the_margin_of_the_sign_rule_is_half_of_a_sample_s_way(on_vehicle, on_ci
         assert game.margin("sign") == pytest.approx(0.025, abs=game.lattice.grid.cell)
 
 
-def test_there_is_no_margin_where_starts_are_lost_without_noise(on_vehicle):
-    assert on_vehicle.margin("left") is None
-
-
 def test_the_margin_is_no_larger_than_what_was_prepared(on_circle):
     game = on_circle
     assert game.margin("hysteresis") == pytest.approx(0.3, abs=game.lattice.grid.cell)

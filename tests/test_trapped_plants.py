@@ -132,6 +132,12 @@ def test_what_cannot_be_used_is_refused(tmp_path, trap):
         check_task(task_of(ROBOTS[trap], tmp_path))
 
 
+def in_file(monkeypatch, room):
+    """Puts code before the class in the files of tasks."""
+    code = TASK.replace("class Robot", f"{room}\n\nclass Robot")
+    monkeypatch.setattr(trapped_plants, "TASK", code)
+
+
 @pytest.mark.parametrize(
     ("room", "code", "says"),
     [
@@ -181,13 +187,8 @@ def test_what_cannot_be_used_is_refused(tmp_path, trap):
     ],
 )
 def test_what_a_file_remembers_or_draws_is_refused(tmp_path, monkeypatch, room, code, says):
-    monkeypatch.setattr(
-        trapped_plants,
-        "TASK",
-        "import functools\nimport itertools\nfrom collections import deque\n"
-        "from types import SimpleNamespace\n"
-        + TASK.replace("class Robot", f"{room}\n\nclass Robot"),
-    )
+    top = "import functools\nimport itertools\nfrom collections import deque\n"
+    in_file(monkeypatch, f"{top}from types import SimpleNamespace\n{room}")
     for name in ("counting", "ticking"):
         text = "COUNT = [0]\n\n\ndef tick():\n    COUNT[0] += 1\n"
         (tmp_path / f"{name}.py").write_text(text)
@@ -248,18 +249,14 @@ class Room:
 
 ROOM = Room()
 """
-    monkeypatch.setattr(
-        trapped_plants, "TASK", TASK.replace("class Robot", f"{room}\n\nclass Robot")
-    )
+    in_file(monkeypatch, room)
     trial.try_methods(task_of(ends(vehicle(), "ends[ROOM.far(y)] = Outcome.CRASHED"), tmp_path))
 
 
 def test_a_file_that_registers_what_can_be_registered_once_is_taken(tmp_path, monkeypatch):
     room = "@hyrl_mj.register_noise\nclass Mine(hyrl_mj.Signal):\n    kind = 'of_a_task_file'\n"
     room += "    def sample(self, now):\n        return 0.0 * now.measurement\n"
-    monkeypatch.setattr(
-        trapped_plants, "TASK", TASK.replace("class Robot", f"{room}\n\nclass Robot")
-    )
+    in_file(monkeypatch, room)
     monkeypatch.setattr(noise, "_KINDS", dict(noise._KINDS))
     trial.try_methods(task_of(vehicle(), tmp_path))
 
