@@ -8,7 +8,6 @@ from hyrl_mj import Noise, Outcome, Sample
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.simulation import lookahead as adversary
 from hyrl_mj.simulation.noise import NOT_STARTED
-from hyrl_mj.simulation.rollout import LoopSettings, closed_loop
 
 EPS = 0.1
 
