@@ -8,6 +8,7 @@ from hyrl_mj import Noise, Outcome, Sample
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.simulation import lookahead as adversary
 from hyrl_mj.simulation.noise import NOT_STARTED
+from hyrl_mj.simulation.rollout import LoopSettings, closed_loop
 
 EPS = 0.1
 
@@ -67,6 +68,18 @@ def test_a_run_that_is_over_is_left_alone(puck, loop):
     plant.set_state(*puck.state(crashed))
     chosen = choose(puck, loop, plant, 0)
     assert not chosen[0].any()
+
+
+def test_no_signal_that_does_not_look_is_worse(puck, loop):
+    z = np.random.default_rng(0).uniform([0.0, -EPS], [0.2, EPS], (200, 2))
+    failed = {}
+    for kind in ("uniform", "alternating", "adversarial"):
+        run = closed_loop(
+            puck, loop, z, Noise(kind, EPS), settings=LoopSettings(vary=True, quiet=True)
+        )
+        failed[kind] = (run.outcome != Outcome.REACHED).mean()
+    assert failed["adversarial"] >= max(failed.values())
+    assert failed["adversarial"] > 0.9
 
 
 def test_a_kinematic_plant_is_looked_at_one_sample_later(vehicle, puck, loop):
