@@ -125,7 +125,9 @@ class Several:
 
     def checked(self, name: str, value: Any) -> tuple[Any, ...]:
         if not isinstance(value, list | tuple) or not self.fewest <= len(value) <= self.most:
-            raise refused(name, value, f"a tuple of {self.fewest} to {self.most} values")
+            exactly = self.fewest == self.most
+            count = self.fewest if exactly else f"{self.fewest} to {self.most}"
+            raise refused(name, value, f"a tuple of {count} values")
         return tuple(self.rule.checked(f"{name}[{i}]", part) for i, part in enumerate(value))
 
 

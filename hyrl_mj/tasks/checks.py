@@ -5,12 +5,13 @@ from collections.abc import Iterator
 from contextlib import suppress
 from difflib import get_close_matches
 from operator import attrgetter
+from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hyrl_mj.errors import BadInput, brief, line_in, listed
+from hyrl_mj.errors import LARGEST_NUMBER, BadInput, brief, line_in, listed
 from hyrl_mj.physics import memory, mjcf, mujoco_log
 from hyrl_mj.ranges import Flag, Integer, Number, OneOf, Optional, Rule, Several, Text
 from hyrl_mj.sets import MOST_DIMENSIONS, Chart
@@ -292,12 +293,7 @@ def _check_parts(task: Task) -> None:
     if not (np.isfinite(chart.scale).all() and np.greater(chart.scale, 0).all()):
         raise BadInput(f"its chart has the scale {chart.scale}: give finite numbers > 0")
     for name in ("start_low", "start_high"):
-        if (count := len(getattr(task, name))) != d:
-            raise BadInput(f"{name} has {count} value(s): its chart takes {d}")
-    if not np.isfinite([task.start_low, task.start_high]).all():
-        raise BadInput(
-            f"its starts lie from {task.start_low} to {task.start_high}: give finite numbers"
-        )
+        Several(Number(-LARGEST_NUMBER, LARGEST_NUMBER), d, d).checked(name, _plain(task, name))
     if np.greater(task.start_low, task.start_high).any():
         raise BadInput("start_low is greater than start_high: exchange them")
     if task.set_point is not None:
@@ -311,7 +307,9 @@ def _check_parts(task: Task) -> None:
             "as many numbers each as observation() has columns, the lower ones first"
         )
     _check_scene(task)
-    shares = [float(share) if isinstance(share, bool | np.bool_) else share for share in task.noisy]
+    shares = _plain(task, "noisy")
+    if isinstance(shares, list | tuple):
+        shares = [float(one) if isinstance(one, bool | np.bool_) else one for one in shares]
     if not any(Several(Number(0, 1e6), d, 1_000).checked("noisy", shares)):
         raise BadInput(
             f"noisy is {task.noisy}: give a share > 0 of the noise bound for one column or more"
@@ -324,6 +322,12 @@ def _check_parts(task: Task) -> None:
         raise BadInput(
             f"noisy is {task.noisy}, so that --eps is the noise of none of {listed(chart.names)}: {remedy}"
         )
+
+
+def _plain(task: Task, name: str) -> Any:
+    """Returns an attribute of a task, an array as a list."""
+    value = getattr(task, name)
+    return value.tolist() if isinstance(value, np.ndarray) else value
 
 
 def _check_scene(task: Task) -> None:
