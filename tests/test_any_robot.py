@@ -297,7 +297,7 @@ MISTAKES = {
         PY, "    def obs", "    def z(self, m):\n        return m[:, :1]\n\n    def obs",
         r"z\(\) .* gives shape \(64, 1\)",
     ),
-    "starts of the wrong dimension": (PY, r"\(0\.0, -0\.8\)", "(0.0,)", r"start_low \(0\.0,\) cannot be used: give a tuple of 2 values"),
+    "starts of the wrong dimension": (PY, r"\(0\.0, -0\.8\)", "(0.0,)", r"start_low .*a tuple of 2 values"),
     "a measurement of the wrong size": (
         PY, "noisy = .*\n", "noisy = (True,) * 3\n", r"measures 4.*`noisy` has 3",
     ),
