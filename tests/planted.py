@@ -151,7 +151,6 @@ def few_trials(patch):
     for module in (inspection, trials, draws, starts, resets):
         for name in few.keys() & vars(module).keys():
             patch.setattr(module, name, few[name])
-    patch.setattr(trials._runs, "__defaults__", (few["EPISODES"],))
 
 
 def without_judges(patch):
@@ -159,8 +158,7 @@ def without_judges(patch):
 
     This takes a third of the time, and what the other trials find does not depend on it.
     """
-    for name in ("check_episodes", "check_noise"):
-        patch.setattr(trials, name, lambda pool: None)
+    patch.setattr(trials, "check_runs", lambda pool: None)
 
 
 def few_steps(patch):
