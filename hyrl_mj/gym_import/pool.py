@@ -12,7 +12,6 @@ import multiprocessing
 import os
 import signal
 import sys
-import time
 import warnings
 from collections import deque
 from collections.abc import Iterable, Sequence
@@ -35,8 +34,6 @@ from hyrl_mj.system.generators import kept_generators
 
 # Fewer episodes than this for each process are played by one.
 FEWEST = 16
-# For how long a process waits awake for another [s]: between two samples it has to for about a millisecond.
-AWAKE = 0.002
 
 
 class Pool:
@@ -179,7 +176,7 @@ class Pool:
     def _answer(self, hand: Connection) -> Any:
         """Returns the answer of a process, or the error that it has ended."""
         try:
-            return _received(hand)
+            return hand.recv()
         except (EOFError, ConnectionError):
             return self._ended()
 
@@ -213,17 +210,6 @@ def _raise_any(answers: Iterable[Any]) -> None:
             raise answer
 
 
-def _received(hand: Connection) -> Any:
-    """Returns what comes through a pipe, which is looked at for `AWAKE` before it is waited for in sleep.
-
-    Who sleeps is woken late, and often on the core of who wakes it.
-    """
-    until = time.perf_counter() + AWAKE
-    while not hand.poll() and time.perf_counter() < until:
-        pass
-    return hand.recv()
-
-
 # ---- in other processes
 
 
@@ -254,7 +240,7 @@ def _serve(work: Connection, spec: EnvironmentSpec) -> None:
     stage = Stage(spec)
     with suppress(EOFError, ConnectionError):
         while True:
-            what, arguments = _received(work)
+            what, arguments = work.recv()
             try:
                 answer = getattr(stage, what)(*arguments)
             except HyrlError as error:
