@@ -131,12 +131,6 @@ def test_some_traps_change_the_next_episode(name):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("i", range(3))
-def test_the_truth_is_the_same_each_time(i):
-    assert not differ(runs_of(honest(i)), runs_of(honest(i)))
-
-
-@pytest.mark.long
 def test_the_judge_notices_any_difference():
     case = honest(0)
     task = hyrl_mj.from_gymnasium(case.factory, **case.given)
