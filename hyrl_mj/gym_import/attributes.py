@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copyreg
 import os
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Set
@@ -12,52 +11,47 @@ from typing import Any
 
 import numpy as np
 
-from hyrl_mj.gym_import.fingerprint import DEEPEST, FUNCTIONS, has_no_memory, is_of_torch
+from hyrl_mj.gym_import.fingerprint import (
+    DEEPEST,
+    FUNCTIONS,
+    attributes_of,
+    has_no_memory,
+    is_of_torch,
+)
 from hyrl_mj.gym_import.opening import physics_of
 
 
-def held(inner: Any) -> Iterator[tuple[str, Any, Any]]:
-    """Yields name, owner and key of numbers and texts in attributes, also within objects.
+def held(inner: Any) -> Iterator[tuple[str, Any, Any, np.ndarray, list[str]]]:
+    """Yields numbers (k,) and texts in attributes, also within objects, with their names, owners and keys.
 
     Views of MuJoCo's arrays are left out, as what they show is its state.
-    What an owner holds, `value_at` gives.
     """
     seen, (_, data) = {id(inner)}, physics_of(inner) or (None, None)
     begins = data.qpos.ctypes.data if data else 0
     state = range(begins, begins + (data.nbuffer if data else 0))  # where MuJoCo keeps it
-    yield from _within(getattr(inner, "__dict__", {}), "", seen, state, 0)
+    yield from _within(inner, attributes_of(inner), "", seen, state)
 
 
 def _within(
-    owner: Any, path: str, seen: set[int], state: range, depth: int
-) -> Iterator[tuple[str, Any, Any]]:
-    """Yields names, owners and keys of what a dictionary, a list, or an object with slots holds."""
-    if isinstance(owner, dict):
-        parts = [*owner.items()]
-    elif isinstance(owner, list):
-        parts = [*enumerate(owner)]
-    else:
-        parts = [(name, getattr(owner, name)) for name in _slots(owner) if hasattr(owner, name)]
-    for key, value in parts:
+    owner: Any, parts: Mapping[Any, Any], path: str, seen: set[int], state: range, depth: int = 0
+) -> Iterator[tuple[str, Any, Any, np.ndarray, list[str]]]:
+    """Yields what `held` does, of the parts of an owner by their keys."""
+    for key, value in parts.items():
         if isinstance(value, np.ndarray) and value.ctypes.data in state:
             continue
-        if taken_apart(value) is not None:
-            yield f"{path}{key}", owner, key
+        if (found := taken_apart(value)) is not None:
+            holder = vars(owner) if key in getattr(owner, "__dict__", ()) else owner
+            yield f"{path}{key}", holder, key, *found
         elif depth < DEEPEST and id(value) not in seen:
             seen.add(id(value))
-            owners = [value]
-            if isinstance(value, tuple | deque):
-                owners = [[*value]]
-            elif not isinstance(value, dict | list):
-                passed = isinstance(value, FUNCTIONS) or has_no_memory(value)
-                owners = [] if passed else [getattr(value, "__dict__", {}), value]
-            for within in owners:
-                yield from _within(within, f"{path}{key}.", seen, state, depth + 1)
-
-
-def _slots(value: Any) -> list[str]:
-    """Returns the names of the attributes of an object that its `__dict__` does not hold."""
-    return copyreg._slotnames(type(value))  # type: ignore[attr-defined]
+            within: Mapping[Any, Any] = {}
+            if isinstance(value, dict):
+                within = dict(value)
+            elif isinstance(value, list | tuple | deque):
+                within = dict(enumerate(value))
+            elif not (isinstance(value, FUNCTIONS) or has_no_memory(value)):
+                within = attributes_of(value)
+            yield from _within(value, within, f"{path}{key}.", seen, state, depth + 1)
 
 
 def value_at(owner: Any, key: Any) -> Any:
@@ -70,7 +64,7 @@ def put_at(owner: Any, key: Any, value: Any) -> None:
     if isinstance(owner, dict | list):
         owner[key] = value
     else:
-        with suppress(AttributeError):  # it is frozen
+        with suppress(AttributeError, TypeError):  # it is frozen, or a tuple
             setattr(owner, key, value)
 
 
@@ -112,8 +106,7 @@ def settings_of(env: Any) -> dict[str, bytes]:
     are left out.
     """
     found = {}
-    for name, owner, key in held(env):
-        numbers, texts = taken_apart(value_at(owner, key)) or (np.empty(0), [])
+    for name, _, _, numbers, texts in held(env):
         words = [text for text in texts if os.sep not in text]
         with np.errstate(over="ignore"):
             found[name] = ascii(words).encode() + numbers.astype("<f4").tobytes()
@@ -128,12 +121,12 @@ def numbers_of(value: Any) -> np.ndarray | None:
 
 def numbers_in(inner: Any) -> dict[str, np.ndarray]:
     """Returns the numbers (k,) that attributes of an environment hold, by name."""
-    return {name: numbers for name, _, _, numbers in _numbers(inner)}
+    return {name: numbers for name, _, _, numbers, _ in held(inner) if len(numbers)}
 
 
 def set_numbers(inner: Any, values: Mapping[str, np.ndarray]) -> None:
     """Sets attributes of an environment to numbers (k,), by name; what is NaN stays as it is."""
-    for name, owner, key, numbers in [*_numbers(inner)]:
+    for name, owner, key, numbers, _ in [*held(inner)]:
         if name in values:
             put_numbers(owner, key, np.where(np.isnan(values[name]), numbers, values[name]))
 
@@ -145,12 +138,6 @@ def put_numbers(owner: Any, key: Any, numbers: np.ndarray) -> None:
         old[...] = numbers.reshape(old.shape)  # it may be known by several names
     else:
         put_at(owner, key, like(old, numbers))
-
-
-def _numbers(inner: Any) -> Iterator[tuple[str, Any, Any, np.ndarray]]:
-    for name, owner, key in held(inner):
-        if (numbers := numbers_of(value_at(owner, key))) is not None:
-            yield name, owner, key, numbers
 
 
 def like(old: Any, numbers: Iterable[Any]) -> Any:

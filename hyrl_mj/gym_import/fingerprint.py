@@ -231,19 +231,24 @@ def _parts(value: Any, path: str, found: Fingerprint, depth: int) -> dict[str, A
         except Exception:  # whatever a foreign class raises
             found[path] = _pickled(value)
         return {}
-    state = object.__getstate__(value)  # with what a class keeps outside of `__dict__`, if it does
-    slots = state[1] if isinstance(state, tuple) else {}
-    # Arguments of a constructor, and methods that are put in by `Instance`.
-    passed = "_ezpickle_args", "_ezpickle_kwargs", "_saved_kwargs", "step", "reset"
-    left_out = passed if depth == 0 else ()
-    own = {name: part for name, part in vars(value).items() if name not in left_out}
+    own = attributes_of(value)
     kind: Any = type(value)
+    if depth == 0:  # arguments of a constructor, and methods that are put in by `Instance`
+        for name in ("_ezpickle_args", "_ezpickle_kwargs", "_saved_kwargs", "step", "reset"):
+            own.pop(name, None)
     if _has_more(kind):
         try:
-            slots = {**(slots or {}), "()": value.__reduce_ex__(2)[1:3]}
+            own["()"] = value.__reduce_ex__(2)[1:3]
         except Exception:  # it cannot be written down
             found[path] = Unknown(id(value))
-    return {f"{path}.{name}" if path else name: part for name, part in {**own, **slots}.items()}
+    return {f"{path}.{name}" if path else name: part for name, part in own.items()}
+
+
+def attributes_of(value: Any) -> dict[str, Any]:
+    """Returns the attributes of an object by name, with those that its class keeps in slots."""
+    state = object.__getstate__(value)
+    slots = state[1] if isinstance(state, tuple) else {}
+    return {**getattr(value, "__dict__", {}), **slots}
 
 
 def _pickled(value: Any) -> Any:

@@ -323,7 +323,8 @@ def _numbers_of_resets(instance: Instance) -> dict[str, tuple[Any, Any, list[int
     """
     at, nq = [c.index for c in instance.spec.coordinates if c.kind == "qpos"], instance.model.nq
     found = dict[str, tuple[Any, Any, list[int]]]()
-    for name, owner, key in (*held(instance.inner), *shared_variables(instance.env)):
+    ours = (place[:3] for place in held(instance.inner))
+    for name, owner, key in (*ours, *shared_variables(instance.env)):
         numbers = numbers_of(value_at(owner, key))
         if numbers is not None and len(at) <= len(numbers) <= nq:
             found[name] = owner, key, at if len(numbers) == nq else [*range(len(at))]
