@@ -622,13 +622,12 @@ class Muscles(OnePlace):
         self.data.act[:] = 0.1
 
 
-@pytest.mark.first(4)
 class Viewed(Puck):
-    """It keeps a view of MuJoCo's positions, and what its model was built from."""
+    """It keeps a view of MuJoCo's positions, and what its model was built from, with a number."""
 
     def __init__(self):
         super().__init__()
-        self.place, self.spec = self.data.qpos[:2], mujoco.MjSpec()
+        self.place, self.built_of = self.data.qpos[:2], (mujoco.MjSpec(), 1.5)
 
     def _get_obs(self):
         return super()._get_obs() | {"position": self.place.copy()}

@@ -45,9 +45,11 @@ def _within(
         elif depth < DEEPEST and id(value) not in seen:
             seen.add(id(value))
             within: Mapping[Any, Any] = {}
+            if isinstance(value, tuple | deque):
+                value = [*value]
             if isinstance(value, dict):
                 within = dict(value)
-            elif isinstance(value, list | tuple | deque):
+            elif isinstance(value, list):
                 within = dict(enumerate(value))
             elif not (isinstance(value, FUNCTIONS) or has_no_memory(value)):
                 within = attributes_of(value)
@@ -64,7 +66,7 @@ def put_at(owner: Any, key: Any, value: Any) -> None:
     if isinstance(owner, dict | list):
         owner[key] = value
     else:
-        with suppress(AttributeError, TypeError):  # it is frozen, or a tuple
+        with suppress(AttributeError):  # it is frozen
             setattr(owner, key, value)
 
 
