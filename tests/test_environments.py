@@ -58,7 +58,6 @@ from hyrl_mj.stages import grounds
 from hyrl_mj.system import cores
 from hyrl_mj.tasks import check_task, described_task, reference
 from hyrl_mj.viz import section
-from hyrl_mj.viz.figures import policy
 from hyrl_mj.viz.replay.marks import tracked_points
 
 # A second for each environment.
@@ -739,7 +738,6 @@ def test_an_agent_is_diagnosed_and_made_robust_in_its_own_environment(tmp_path, 
     spare_environments(monkeypatch)
     without_pictures(monkeypatch)
     monkeypatch.setattr(section, "OVER", 60)  # each cell is another start
-    monkeypatch.setattr(policy, "MAP", 30)
     monkeypatch.setitem(presets._GRIDS_DYNAMIC, 2, (14, 18))  # coarser than preset smoke
     monkeypatch.setattr(grounds, "ATTACKED", 6)
     few = {"episodes": 8, "attack_starts": 10, "attack_rounds": 1}
