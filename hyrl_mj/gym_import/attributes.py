@@ -95,6 +95,8 @@ def _take(value: Any, found: list[Any]) -> None:
             _take(part, found)
     elif isinstance(value, Set):
         found += sorted(part for part in value if isinstance(part, str))
+    elif isinstance(value, complex):
+        found += value.real, value.imag
     elif isinstance(value, str | Number):
         found.append(value)
     elif not isinstance(value, bytes | None | np.bool_):
@@ -150,9 +152,13 @@ def like(old: Any, numbers: Iterable[Any]) -> Any:
     if isinstance(old, list | tuple | deque):
         parts = [like(part, numbers) for part in old]
         return type(old)(*parts) if hasattr(old, "_fields") else type(old)(parts)
+    if is_of_torch(old, "Tensor"):
+        return old.new_tensor(like(old.detach().cpu().numpy(), numbers))
     if isinstance(old, np.ndarray):
         values = np.array(like(old.ravel().tolist(), numbers)).reshape(old.shape)
         return values if _are_parts(values, old.dtype) else values.astype(old.dtype)
+    if isinstance(old, complex):
+        return type(old)(complex(next(numbers), next(numbers)))
     if not isinstance(old, Number):
         return old
     number: Any = next(numbers)
