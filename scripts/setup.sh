@@ -51,8 +51,10 @@ if ! [ -x "$venv/bin/pip" ]; then
       exit 2
     }
 fi
+# Python compiles what it imports, and most of what is installed is never imported. What it has compiled is kept,
+# whatever the shell says: the libraries would be compiled anew by each process, which takes longer than most tests.
+unset PYTHONDONTWRITEBYTECODE
 echo "Installing hyrl_mj into $venv (a minute or two the first time) ..."
-# Python compiles what it imports, and most of what is installed is never imported.
 "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --no-compile --editable "$1"
 wait
 trap - EXIT

@@ -70,6 +70,7 @@ def test_a_run_that_is_over_is_left_alone(puck, loop):
     assert not chosen[0].any()
 
 
+@pytest.mark.slow
 def test_no_signal_that_does_not_look_is_worse(puck, loop):
     z = np.random.default_rng(0).uniform([0.0, -EPS], [0.2, EPS], (200, 2))
     failed = {}

@@ -229,6 +229,7 @@ def test_a_zip_of_sb3_1_with_shared_layers_acts_as_it_did(vehicle, tmp_path):
     assert_it_acts_alike(policy, model, vehicle, observations(vehicle))
 
 
+@pytest.mark.slow
 def test_training_goes_on_from_an_agent_of_the_same_networks_only(circle, tmp_path):
     settings = preset(circle, "smoke").stage1
     agent = load_agent(saved(untrained(A2C, circle, activation_fn=nn.SiLU), tmp_path), circle)
@@ -258,6 +259,7 @@ def test_it_draws_from_sb3s_distribution(algorithm, name, tmp_path):
         np.testing.assert_allclose(found, expected, atol=0.02)
 
 
+@pytest.mark.slow
 def test_the_same_seed_draws_the_same_inputs_call_by_call(agent, circle):
     first, second, other = (load_agent(agent, circle, stochastic=True, seed=s) for s in (3, 3, 4))
     assert isinstance(first, SampledPolicy)
@@ -340,6 +342,7 @@ def test_a_torn_zip_is_refused(agent, circle):
             load_agent(agent, circle)
 
 
+@pytest.mark.slow
 def test_tensors_that_unpack_to_gigabytes_are_refused(agent, circle):
     endless = torch.zeros(1).as_strided((100_000, 100_000), (0, 0))
     with_tensors(agent, lambda state: {**state, "action_net.weight": endless})
@@ -568,6 +571,7 @@ def numbers():
     return np.random.default_rng(0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rows", "observed"), [("n", ""), (1, ""), ("n", "float64")])
 def test_an_onnx_model_acts(rows, observed, circle, numbers, tmp_path, monkeypatch):
     # As of the environments of Gymnasium that MuJoCo simulates.
@@ -580,6 +584,7 @@ def test_an_onnx_model_acts(rows, observed, circle, numbers, tmp_path, monkeypat
     assert policy.act(np.zeros((1, 1))).shape == (1, 1)
 
 
+@pytest.mark.slow
 def test_an_onnx_model_that_ends_in_tanh_has_inputs_between_one_and_minus_one(
     circle, numbers, tmp_path
 ):

@@ -86,6 +86,7 @@ def test_metadata_of_absurd_depth_are_refused(data, agent, circle):
     refused(rewritten(agent, data=data), circle, "cannot be read")
 
 
+@pytest.mark.slow
 def test_texts_from_the_file_are_cut_in_messages(agent, circle):
     long = "x" * 10**6
     with_metadata(agent, policy_kwargs={"features_extractor_class": long})

@@ -40,6 +40,7 @@ def starts_of_vehicle(n):
     return np.random.default_rng(0).uniform((0, 0.3), (0.2, 0.4), (n, 2))
 
 
+@pytest.mark.slow
 def test_what_the_traps_below_are_set_in_is_taken(circle, vehicle):
     for task in (circle, vehicle):
         read_agent(task, steering(task))
@@ -254,6 +255,7 @@ def as_alone(task, plain, measured):
     return np.array(list(plain(task.observation(measured).astype(np.float32))))[:, None]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "noise"),
     [
@@ -329,6 +331,7 @@ def test_an_attack_asks_and_changes_no_memory(puck):
         np.testing.assert_allclose(run.u[:end, row], expected, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_agents_whose_memory_shows_late_are_not_taken_for_each_other(vehicle):
     class Held:
         """Holds its first level for some samples."""
@@ -354,6 +357,7 @@ def test_a_run_backward_has_no_memory(circle):
     np.testing.assert_array_equal(run.u[:, 0], policy.act(run.measured[:, 0]))
 
 
+@pytest.mark.slow
 def test_a_model_of_sb3_contrib_acts_as_there(circle):
     contrib = pytest.importorskip("sb3_contrib")
     env = TaskVecEnv(BatchedEnv(circle, 1, threads=1))
@@ -512,6 +516,7 @@ SPOILT = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", SPOILT)
 def test_a_memory_that_is_none_is_refused(kind, circle):
     make, message = SPOILT[kind]

@@ -216,6 +216,7 @@ def test_the_smoke_preset_learns_the_circle(algorithm, circle, monkeypatch):
     assert evaluate(circle, train(circle, settings, 0))[1] > before + 10
 
 
+@pytest.mark.slow
 def test_every_preset_has_every_algorithm_or_says_so():
     for algorithm, name in CAN:
         task = hyrl_mj.get_task(name)

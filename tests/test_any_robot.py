@@ -195,6 +195,7 @@ def test_gymnasium_knows_it(wasp):
     assert reference(hyrl_mj.get_task("wasp")) == str(wasp)
 
 
+@pytest.mark.slow
 def test_an_installed_package_can_offer_tasks(unknown_tasks, wasp, tmp_path, monkeypatch):
     described = tmp_path / "site" / "wasps-1.0.dist-info"
     described.mkdir(parents=True)
@@ -352,6 +353,7 @@ MISTAKES = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_a_mistake_is_one_sentence_before_any_training(unknown_tasks, tmp_path, mistake):
     file, old, new, says = MISTAKES[mistake]

@@ -31,6 +31,7 @@ def run(vehicle):
     )
 
 
+@pytest.mark.slow
 def test_the_starts_are_the_paper_s_and_one_on_the_critical_set_that_is_lost(run, monkeypatch):
     arcs = replay_arcs(run)
     names = ["start0", "start1", "start2", "start3", "start4", "critical"]
@@ -63,6 +64,7 @@ def test_all_controllers_meet_the_noise_that_was_asked_for(run):
     assert [arc.q[0] for arc in chosen] == [0, 1]
 
 
+@pytest.mark.slow
 def test_the_worst_noise_is_each_controller_s_own(run):
     arcs = noisy_arcs(run, np.array([[0.1, 0.05]]), "worst", None, (0, 1))
     (policy,) = arcs["policy"]
@@ -79,6 +81,7 @@ def test_the_worst_noise_lasts_as_long_as_the_run_and_keeps_the_bound_that_was_a
     assert (np.abs(arc.measured - arc.z)[:-1, 1] > 0.1).all()
 
 
+@pytest.mark.slow
 def test_shows_are_one_for_each_mode_or_all_of_the_paper_s_at_once(run):
     arcs = replay_arcs(run)
     assert len(arcs) == 6 * 3

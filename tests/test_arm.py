@@ -66,6 +66,7 @@ def test_its_joints_follow_their_inputs(arm):
     assert not plant.warnings.any()
 
 
+@pytest.mark.slow
 def test_the_lattice_of_its_game_is_exact(arm):
     """A sample moves a joint by whole cells: what is proved on the nodes holds for the arm.
 

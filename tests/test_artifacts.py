@@ -189,6 +189,7 @@ def test_arrays_that_unpack_to_more_than_their_limit_are_refused(tmp_path):
     assert {name: array.shape for name, array in found.items()} == {"x": (2**16,), "y": (3,)}
 
 
+@pytest.mark.slow
 def test_the_largest_arrays_are_in_memory_once(tmp_path):
     content = {"kind": "kind", "version": artifacts.VERSION, "x": np.zeros(2**23)}  # 64 MiB
     np.savez(tmp_path / "a.npz", **content)

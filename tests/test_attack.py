@@ -165,6 +165,7 @@ def test_a_traceback_is_no_sentence(tmp_path):
     assert "traceback" in answered(work, tmp_path)
 
 
+@pytest.mark.slow
 def test_a_process_that_hangs_is_ended_with_those_that_it_began(tmp_path):
     def work():
         subprocess.run(["sleep", "60"], check=False)
@@ -174,6 +175,7 @@ def test_a_process_that_hangs_is_ended_with_those_that_it_began(tmp_path):
     assert time.monotonic() - began < 30
 
 
+@pytest.mark.slow
 def test_a_process_that_is_busy_for_ever_is_ended(tmp_path):
     def work():
         while True:
@@ -188,6 +190,7 @@ def test_a_signal_ends_a_process(tmp_path):
     assert "exit status -15" in answer.broke()
 
 
+@pytest.mark.slow
 def test_memory_is_that_of_the_process(tmp_path):
     # In a process as small as that of an attack: a fork begins with the memory of the one that forks.
     code = (

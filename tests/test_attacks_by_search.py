@@ -86,6 +86,7 @@ def test_a_run_that_only_stalls_is_lost(circle):
     assert found.strongest in (0, 1)
 
 
+@pytest.mark.slow
 def test_an_order_of_noise_is_found_that_no_rule_gives_alone(vehicle):
     held = on(vehicle, Lock(), ON_THE_LEFT, rounds=2)
     assert held.count.lost == 0
@@ -102,6 +103,7 @@ def kept_parts(vehicle, agent):
     return {q: PartPolicy(vehicle, agent, part, 0.1, whole=True) for q, part in parts}
 
 
+@pytest.mark.slow
 def test_signals_against_an_agent_do_the_same_to_modes_that_all_keep_it(vehicle):
     agent = sign_policy(vehicle)
     flow_sets = dict(zip((0, 1), halves(vehicle).parts, strict=True))
@@ -131,6 +133,7 @@ def test_a_run_keeps_its_agent_if_each_mode_is_the_agent_everywhere(vehicle, tmp
         assert run.keeps_agent == keeps
 
 
+@pytest.mark.slow
 def test_what_cannot_be_beaten_is_not(vehicle, circle):
     starts = np.random.default_rng(0).uniform((0.0, -0.1), (0.2, 0.1), (20, 2))
     left = on(vehicle, PolicyController(one_way_policy(vehicle, clear=1.004)), starts, rounds=1)
@@ -174,6 +177,7 @@ def test_the_hybrid_controller_may_be_attacked_in_its_choice_of_a_mode(vehicle):
 # ---- budgets
 
 
+@pytest.mark.slow
 def test_the_same_rounds_give_the_same_on_any_number_of_threads(vehicle, monkeypatch):
     monkeypatch.setattr(cores, "allowed", 1)
     first = on(vehicle, Lock(), ON_THE_LEFT, rounds=4, seed=3)
@@ -184,6 +188,7 @@ def test_the_same_rounds_give_the_same_on_any_number_of_threads(vehicle, monkeyp
         np.testing.assert_array_equal(one.measured, two.measured)
 
 
+@pytest.mark.slow
 def test_seconds_only_decide_how_many_rounds_are_done(vehicle):
     loop = {"it": Lock()}
     timed = attack(vehicle, loop, ON_THE_LEFT, EPS, Budget(seconds=0.3))["it"]
@@ -485,6 +490,7 @@ def test_a_bias_that_turns_at_the_jump_is_found(vehicle):
     assert found.count.lost == len(STARTS)
 
 
+@pytest.mark.slow
 def test_all_are_tried_with_the_same_rules_and_several_modes_with_more(vehicle):
     loops = {
         "one": PolicyController(one_way_policy(vehicle, clear=1.004)),

@@ -117,6 +117,7 @@ def test_a_run_whose_game_turns_out_to_decide_nothing_is_attacked(examined, monk
         assert bool(examination.examine(subject, options, attacked).robustness.attacks) == attacked
 
 
+@pytest.mark.slow
 def test_the_rounds_of_a_time_repeat_it(copied):
     timed = examine_run(load_run(copied), ExamineOptions(**FEW, attack_seconds=0.2), say=str)
     files = {path: path.read_bytes() for path in sorted((copied / "arcs").glob("attack_*"))}

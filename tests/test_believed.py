@@ -195,6 +195,7 @@ def test_what_mujoco_does_not_use_is_refused(old, new, message, tmp_path):
 SWAPPED = (XML, r'name="x"(.*)"1 0 0"/>\n(.*)"0 1 0"', r'name="x"\1"0 1 0"/>\n\2"1 0 0"')
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "edit",
     [
@@ -210,6 +211,7 @@ def test_a_chart_that_begins_with_another_place_is_refused(edit, tmp_path):
         check_task(task)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("code", ["100 * measured[:, :2]", "measured[:, 1::-1]"])
 def test_places_that_are_not_on_the_robot_are_refused(code, tmp_path):
     where = f"def where(self, measured):\n        return {code}\n\n    def miss"

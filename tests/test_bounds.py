@@ -199,6 +199,7 @@ def drawn_boxes(rng):
     return centre, half
 
 
+@pytest.mark.slow
 def test_random_programs_stay_within_their_bounds():
     bounded, undefined, sharp = 0, 0, 0
     for seed in range(PROGRAMS):

@@ -151,6 +151,7 @@ def test_the_share_that_is_proved_falls_with_the_noise(certified):
             assert not (more & ~less).any()
 
 
+@pytest.mark.slow
 def test_starts_that_count_as_broken_are_lost_on_the_plant(certified):
     game, loops, certificate = certified
     for name, loop in loops.items():
@@ -170,6 +171,7 @@ def test_starts_that_count_as_broken_are_lost_on_the_plant(certified):
             assert beaten.mean() > 0.9 or not game.lattice.exact
 
 
+@pytest.mark.slow
 def test_noise_between_the_nodes_beats_what_the_game_calls_won(vehicle):
     """A start set that flips right beside a node of the game, as nobody can see on the nodes."""
     loops = {"hyrl": hybrid(vehicle, overlap=EPS - 0.004)}
@@ -180,6 +182,7 @@ def test_noise_between_the_nodes_beats_what_the_game_calls_won(vehicle):
     assert own <= (~broken.own[region]).mean() <= nodes.won
 
 
+@pytest.mark.slow
 def test_what_cannot_be_bounded_is_attacked_all_the_same(vehicle):
     loops = {"policy": PolicyController(sign_policy(vehicle)), "hyrl": ideal_controller(vehicle)}
     game, certificate = games(vehicle, loops, 60)
@@ -224,6 +227,7 @@ def test_an_examination_carries_what_is_proved(vehicle, monkeypatch):
     assert (proved <= np.isin(game.map("hyrl", EPS), (WON, WON_FROM_SOME))).all()
 
 
+@pytest.mark.slow
 def test_where_runs_never_end_what_is_proved_stays_at_the_set_point(circle):
     loops = {"policy": PolicyController(turning(circle))}
     _, certificate = games(circle, loops, 1_000, 0.35)
@@ -239,6 +243,7 @@ def test_where_runs_never_end_what_is_proved_stays_at_the_set_point(circle):
     assert certificate.wins("policy", 0.35) == (0.0, 0.0, 0.0, 0.0)
 
 
+@pytest.mark.slow
 def test_nothing_is_proved_of_a_start_region_that_is_thinner_than_a_cell(vehicle, monkeypatch):
     monkeypatch.setattr(examination, "_replays", lambda certificate, scores: ())
 
@@ -256,6 +261,7 @@ def test_nothing_is_proved_of_a_start_region_that_is_thinner_than_a_cell(vehicle
     assert (score.proved, score.not_broken) == (0.0, score.won)
 
 
+@pytest.mark.slow
 def test_shares_of_the_box_are_none_of_starts_that_are_drawn_where_it_loses(vehicle, monkeypatch):
     monkeypatch.setattr(examination, "_replays", lambda certificate, scores: ())
 

@@ -58,6 +58,7 @@ def close_by():
 # ---- sets
 
 
+@pytest.mark.slow
 def test_the_signed_distance_is_the_better_the_more_nodes(close_by):
     z, exact = close_by
     errors = []
@@ -106,6 +107,7 @@ def test_a_box_moves_the_edge_as_far_as_its_corners_reach(half, close_by):
     assert half.dilated_by_box(np.zeros(6)) is half
 
 
+@pytest.mark.slow
 def test_points_are_projected_along_noisy_coordinates(half, close_by):
     z, exact = close_by
     landed = half.project(z)
@@ -245,11 +247,13 @@ def case():
     return Case(7, 8)
 
 
+@pytest.mark.slow
 def test_the_critical_set_is_the_surface(case):
     assert case.critical.pieces == 1
     assert np.abs(hall_distance(case.critical.points)).max() <= case.critical.resolution * 2
 
 
+@pytest.mark.slow
 def test_the_parts_meet_at_the_surface(case, close_by):
     assert case.partition.modes == (0, 1)
     z, exact = close_by
@@ -259,6 +263,7 @@ def test_the_parts_meet_at_the_surface(case, close_by):
     assert (down.contains(z) == (exact < 0))[clear].mean() > 0.985
 
 
+@pytest.mark.slow
 def test_the_extended_sets_hold_what_noise_can_reach_and_not_much_more(case):
     z = drawn(20_000, 6)
     distance = hall_distance(z)
@@ -272,6 +277,7 @@ def test_the_extended_sets_hold_what_noise_can_reach_and_not_much_more(case):
         assert held[side[mode] * distance > (2 * EPS + 0.05) * 1.75].mean() < 0.01
 
 
+@pytest.mark.slow
 def test_noise_does_not_make_the_hybrid_controller_chatter(case):
     task = case.task
     sets = dict(zip(case.extended.modes, case.extended.sets, strict=True))
@@ -289,6 +295,7 @@ def test_noise_does_not_make_the_hybrid_controller_chatter(case):
     assert reversals.mean() > 3, "the policy alone dithers"
 
 
+@pytest.mark.slow
 def test_sets_on_scattered_nodes_survive_being_written(case, tmp_path):
     z = drawn(200, 8)
     for result, kind in ((case.partition, Partition), (case.extended, ExtendedSets)):

@@ -178,6 +178,7 @@ def test_the_next_observation_is_that_of_the_same_episode():
     assert pairs == first | {(10, 11), (11, 12), (12, 13), (13, 13)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["CAPS", "Lipschitz"])
 def test_a_heavy_penalty_makes_the_policy_flat(given, kind):
     steep = {}
@@ -197,6 +198,7 @@ def test_a_heavy_penalty_makes_the_policy_flat(given, kind):
     assert steep[1e4] < steep[0.0] / 2
 
 
+@pytest.mark.slow
 def test_a_training_that_breaks_off_is_one_sentence(given, monkeypatch):
     def broken(self):
         raise ValueError("the parameter loc holds nan")
@@ -232,6 +234,7 @@ def test_the_probability_of_a_mixture_is_the_sum_over_its_components(levels):
     np.testing.assert_array_equal(mixture.mode(), chosen.argmax(dim=1) if levels else chosen)
 
 
+@pytest.mark.slow
 def test_the_component_of_the_first_measurement_is_held(given):
     model = learned(
         given,
@@ -283,6 +286,7 @@ def test_the_value_of_a_failure_is_the_worst_reward_for_ever(vehicle):
 # ---- adversary
 
 
+@pytest.mark.slow
 def test_learned_noise_keeps_its_bound(given):
     noise = train_adversary(given, given.run.policy, 2_048, 0)
     assert isinstance(noise, LearnedNoise)
@@ -305,6 +309,7 @@ def test_an_alternative_gets_the_samples_of_the_whole_run(planted_circle):
     assert given.training().algorithm == s.stage1.algorithm
 
 
+@pytest.mark.slow
 def test_an_alternative_is_paid_as_stage_1_was_and_takes_no_more_samples(
     planted_circle, monkeypatch
 ):
@@ -377,6 +382,7 @@ def result(folder, small):
     return found, said
 
 
+@pytest.mark.slow
 def test_rows_are_made_tuned_and_judged_alike(result, folder, planted_circle):
     found, said = result
     assert len({row.figures["attacked"] for row in found.rows}) == 1
@@ -400,6 +406,7 @@ def test_rows_are_made_tuned_and_judged_alike(result, folder, planted_circle):
     assert Compared.load(folder) == found
 
 
+@pytest.mark.slow
 def test_what_is_done_is_not_done_again(result, folder, monkeypatch):
     monkeypatch.setattr(comparing, "judged", None)
     said = []
@@ -408,6 +415,7 @@ def test_what_is_done_is_not_done_again(result, folder, monkeypatch):
     assert said == ["seed 0: done before"]
 
 
+@pytest.mark.slow
 def test_rows_of_other_code_are_made_again(result, circle):
     found, said = result[0], []
     assert comparing._without_outdated(found, circle, said.append) == found
@@ -475,6 +483,7 @@ def test_settings_that_no_comparison_holds_are_none(labels, planted_circle, monk
         assert comparing._code(task, "many") != comparing._code(task, "many")
 
 
+@pytest.mark.slow
 def test_what_did_not_fit_is_tried_again(result, folder, small, monkeypatch):
     never(monkeypatch, Unfit("nothing fits it"))
     said = []
@@ -505,6 +514,7 @@ def test_an_alternative_cannot_change_the_run_of_the_others(planted_circle, monk
     np.testing.assert_array_equal(run.policy.layers[0][0], before)
 
 
+@pytest.mark.slow
 def test_no_controller_is_attacked_from_starts_of_its_own(planted_circle, small, monkeypatch):
     """Which are winnable is known only where the game is played, and by HyRL's split."""
     run = planted_circle[0]
@@ -545,6 +555,7 @@ def test_sensors_that_a_task_declares_are_compared_and_not_swept(circle, tmp_pat
         hyrl_mj.sweep([task], out=tmp_path / "sweep")
 
 
+@pytest.mark.slow
 def test_the_page_shows_the_figure_and_the_table(result, folder):
     page = (folder / "compare.html").read_text()
     assert "data:image/png" in page
@@ -553,6 +564,7 @@ def test_the_page_shows_the_figure_and_the_table(result, folder):
     assert (folder / "compare.png").stat().st_size > 5_000
 
 
+@pytest.mark.slow
 def test_wrong_values_are_a_sentence_each(result, folder, tmp_path):
     with pytest.raises(BadInput, match="alternative 'helt'"):
         hyrl_mj.compare("unit_circle", only=("helt",), out=folder)
@@ -568,6 +580,7 @@ def test_wrong_values_are_a_sentence_each(result, folder, tmp_path):
     assert error.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_a_comparison_that_ended_before_its_first_row_is_resumed(tmp_path, monkeypatch):
     def ended(*arguments, **options):
         (tmp_path / "compare" / "hyrl-0").mkdir(exist_ok=True)

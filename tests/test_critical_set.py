@@ -74,6 +74,7 @@ def test_a_continuous_policy_has_one_too(search, circle):
 # ---- two dimensions
 
 
+@pytest.mark.slow
 def test_a_critical_line_before_the_obstacle(search, vehicle):
     critical = search(vehicle, sign_policy(vehicle), 60, RESOLUTION)
     x, y = critical.points.T
@@ -84,6 +85,7 @@ def test_a_critical_line_before_the_obstacle(search, vehicle):
     assert 0.4 <= x.max() <= 0.8
 
 
+@pytest.mark.slow
 def test_a_slanted_critical_line(search, vehicle):
     def line(x):
         return 0.1 - 0.4 * x

@@ -24,6 +24,7 @@ def settings_of(task, algorithm="ppo"):
     return replace(preset(task, "smoke").stage6, algorithm=algorithm, options={}, hidden=(32, 32))
 
 
+@pytest.mark.slow
 def test_a_copy_gives_the_continuous_inputs_of_the_original(circle):
     policy = homing_policy(circle)
     copy = distil(circle, policy, circle.starts, settings_of(circle, "a2c"), seed=0)
@@ -32,6 +33,7 @@ def test_a_copy_gives_the_continuous_inputs_of_the_original(circle):
     np.testing.assert_allclose(copy.act(z), policy.act(z), atol=0.3)
 
 
+@pytest.mark.slow
 def test_a_copy_chooses_the_levels_of_the_original(vehicle):
     policy = one_way_policy(vehicle, side=1.0, clear=0.3)
     copy = distil(vehicle, policy, vehicle.starts, settings_of(vehicle), seed=0)
@@ -41,6 +43,7 @@ def test_a_copy_chooses_the_levels_of_the_original(vehicle):
     assert set(np.unique(copy.act(z))) <= set(vehicle.input_levels[:, 0])
 
 
+@pytest.mark.slow
 def test_it_is_copied_at_the_starts_that_it_is_given(circle):
     """Where no state was seen nothing is known: a copy of one half is right on that half."""
 

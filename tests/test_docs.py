@@ -84,6 +84,7 @@ def test_the_gallery_shows_every_picture_and_these_are_small():
     assert all(path.stat().st_size < 400_000 for path in pictures)
 
 
+@pytest.mark.slow
 def test_the_script_of_the_gallery_draws_its_pictures(
     planted_circle, tmp_path, monkeypatch, capsys
 ):

@@ -20,6 +20,7 @@ def healthy(monkeypatch):
     monkeypatch.setattr(doctor, "_encoding", lambda: "encoded")
 
 
+@pytest.mark.slow
 def test_versions_without_importing():
     code = (
         "import sys; from hyrl_mj.cli import doctor; lines, missing = doctor.versions();"
@@ -62,6 +63,7 @@ def test_a_missing_distribution(healthy, monkeypatch):
     assert "cure: pip install no-such-distribution" in lines
 
 
+@pytest.mark.slow
 def test_no_gl(monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "disable")
     monkeypatch.setattr(doctor, "_encoding", lambda: "encoded")
@@ -72,6 +74,7 @@ def test_no_gl(monkeypatch):
     assert line.count(doctor.GL_CURE) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("code", "says"),
     [("import os; os.abort()", "SIGABRT"), ("import time; time.sleep(60)", "within")],
@@ -91,6 +94,7 @@ def test_ffmpeg(monkeypatch, tmp_path):
         doctor._encoding()
 
 
+@pytest.mark.slow
 @needs_gl
 def test_it_says_what_renders_and_how_fast():
     name, speed = doctor._rendering().rsplit(", ", 1)

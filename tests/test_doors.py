@@ -200,6 +200,7 @@ def test_a_model_of_the_users_own_is_tried_once(tmp_path, monkeypatch):
     assert mjcf.load(path).ngeom == 1
 
 
+@pytest.mark.slow
 def test_an_environment_of_a_hostile_model_is_one_sentence(tmp_path):
     path = tmp_path / "robot.xml"
     path.write_text(f"<mujoco>{doors.MODELS['attaches itself']}</mujoco>")
@@ -223,6 +224,7 @@ def test_an_environment_that_this_process_registered_takes_arguments_also_arrays
     assert task.max_steps == 50
 
 
+@pytest.mark.slow
 def test_a_step_that_takes_long_is_one_sentence(monkeypatch):
     monkeypatch.setitem(limits.tried.__kwdefaults__, "seconds", limits.SECONDS)
     monkeypatch.setattr(limits.limit, "__defaults__", (limits.SECONDS, limits.MEMORY))
@@ -238,6 +240,7 @@ def test_an_environment_that_never_ends_a_step_is_one_sentence():
     assert "takes longer than" in sentence
 
 
+@pytest.mark.slow
 def test_a_model_writes_no_warnings_into_the_current_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "robot.xml"

@@ -309,6 +309,7 @@ def test_the_law_of_the_modes_turns_to_the_way_on_its_side():
         np.testing.assert_allclose(TangentLaw(task, side).act(measured), expected, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_both_controllers_drive_from_every_start(planted, read):
     field = read(posts=[POST, post(-4.5, 2)], starts=[start(-6, 0.3), start(-6, -0.3)])
     result = driven(planted, field)
@@ -332,6 +333,7 @@ def test_both_controllers_drive_from_every_start(planted, read):
     assert [changes(arc) for arc in result.arcs["hyrl"]] == [0, 0]
 
 
+@pytest.mark.slow
 def test_changes_of_focus_and_side_are_counted(planted, read):
     field = read(posts=[POST, post(-6.5, 0.1)], starts=[start(-8.5, 0.0)], time_s=7)
     result = driven(planted, field)
@@ -340,6 +342,7 @@ def test_changes_of_focus_and_side_are_counted(planted, read):
     assert changes(arc) == sum(a != b for a, b in pairwise(names)) > 0
 
 
+@pytest.mark.slow
 def test_a_goal_that_a_post_stands_on_in_the_end_is_waited_for(planted, read):
     comes = {"radius_m": 0.5, "positions_m": [[2.0, 0.0], [0.0, 0.0]]}
     result = driven(planted, read(posts=[comes], interval_s=5, starts=[start(-7, 0)], time_s=8))
@@ -348,6 +351,7 @@ def test_a_goal_that_a_post_stands_on_in_the_end_is_waited_for(planted, read):
     assert ending(far.arcs["hyrl"][0]) == "stalled"
 
 
+@pytest.mark.slow
 def test_who_waits_near_the_goal_has_not_arrived(planted, read):
     """A robot that stands still is not led to the goal by a post that stands close to it."""
     starts = [start(-1.5, 0), start(-1.4, 0.2), start(-1.2, 1), start(-6, 0)]
@@ -376,6 +380,7 @@ def test_a_post_far_from_the_goal_is_none_to_wait_for(planted, read):
     assert ending(result.arcs["hyrl"][0]) == "stalled"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("phase", [0.0, 0.3])
 def test_no_post_leaps_over_a_robot_between_two_samples(planted, read, phase):
     """At 100 m/s a post moves 5 m a sample: it is seen in touch with the robot at none of them."""
@@ -391,6 +396,7 @@ def test_no_post_leaps_over_a_robot_between_two_samples(planted, read, phase):
         assert np.isnan(arc.measured[-1]).all()
 
 
+@pytest.mark.slow
 def test_the_least_clearance_is_that_of_a_fine_look(planted, read):
     moving = {"radius_m": 0.4, "positions_m": [[-3, 1.5], [-2.5, 0.9], [-3.2, 1.6], [-3, 1]]}
     field = read(posts=[moving, post(-4, -1)], interval_s=0.77, starts=[start(-5, 0)], time_s=6)
@@ -404,6 +410,7 @@ def test_the_least_clearance_is_that_of_a_fine_look(planted, read):
     assert least_clearance(result.task, arc) <= fine + 1e-9
 
 
+@pytest.mark.slow
 def test_the_bounds_are_those_that_were_asked_for(planted, read):
     made_for = bounds_made_for(planted.task, 0.1)
     assert made_for == Bounds(0.1, 0.05, 0.0, 0.0)
@@ -448,6 +455,7 @@ def test_more_noise_than_that_of_the_run_is_said(planted):
     assert noise_cautions(planted.task, 0.1, replace(options, noise="none")) == []
 
 
+@pytest.mark.slow
 def test_an_attack_is_at_least_as_bad(planted, read, monkeypatch):
     monkeypatch.setattr(drives, "ROUNDS", 1)
     result = driven(planted, read(time_s=1), attack=True, eps=0.05)
@@ -459,6 +467,7 @@ def test_an_attack_is_at_least_as_bad(planted, read, monkeypatch):
     assert clearance[0] < clearance[1] + 0.05
 
 
+@pytest.mark.slow
 def test_what_the_noise_of_the_options_loses_is_lost_to_the_worst_noise(planted, read, monkeypatch):
     field = read(starts=[start(-5, 0.3)], time_s=6)
     plain = driven(planted, field).arcs
@@ -524,6 +533,7 @@ def looked_at(content, arc):
     return np.hypot(*path[-1]), least, moved
 
 
+@pytest.mark.slow
 @pytest.mark.first(2)
 @pytest.mark.parametrize("seed", range(40))
 def test_what_is_said_of_a_run_is_so(planted, tmp_path, seed):
@@ -576,6 +586,7 @@ def command(planted, monkeypatch, capsys):
     return call
 
 
+@pytest.mark.slow
 def test_the_command_prints_a_table_and_writes_nothing(command, written, tmp_path, caplog):
     path = written({**ONE, "posts": [POST, post(-3, 1.5)]})
     status, out, _ = command("--field", path, "--eps", "0.12")

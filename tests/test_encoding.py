@@ -85,6 +85,7 @@ def program(tmp_path, monkeypatch):
     return put
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("script", "why"), PROGRAMS.values(), ids=PROGRAMS)
 def test_a_program_that_does_something_else_ends_in_a_sentence(tmp_path, program, script, why):
     program(script)
@@ -135,6 +136,7 @@ def test_without_any_program_the_cure_is_said(tmp_path, monkeypatch):
         write(tmp_path / "film.mp4")
 
 
+@pytest.mark.slow
 def test_an_error_of_who_draws_ends_the_program_and_is_his(tmp_path, program):
     program("echo $$ >&2; exec sleep 600")
     before = threading.active_count()

@@ -56,6 +56,7 @@ def agent(kind, wrapped, folder):
     return model, env, folder / "agent.zip", needs
 
 
+@pytest.mark.slow
 @pytest.mark.first(4)
 @pytest.mark.parametrize("wrapped", WRAPPED)
 @pytest.mark.parametrize("kind", [PPO, SAC])
@@ -97,6 +98,7 @@ def test_noise_beside_the_chart_of_an_environment_is_refused(puck):
     assert (np.abs(arc.measured[:-1, :2] - arc.z[:-1]) > 0).all()
 
 
+@pytest.mark.slow
 def test_a_run_keeps_it_as_it_was(puck, tmp_path):
     _, _, path, needs = agent(PPO, "stacked, normalised", tmp_path)
     external = read_agent(puck, path, **needs)
@@ -229,6 +231,7 @@ class OnAMap(Puck):
         return np.concatenate([5e6 + self.data.qpos, self.data.qvel])
 
 
+@pytest.mark.slow
 def test_normalised_numbers_of_float64_are_not_rounded_before(tmp_path):
     env = VecNormalize(DummyVecEnv([OnAMap]), norm_reward=False)
     model = SAC("MlpPolicy", env, seed=0, device="cpu", policy_kwargs={"net_arch": [16]})

@@ -113,6 +113,7 @@ def test_a_seed_repeats_episodes_bit_for_bit(task):
     assert not np.array_equal(record_single(task.name, 3)[:3], record_single(task.name, 4)[:3])
 
 
+@pytest.mark.slow
 def test_a_seed_repeats_vector_episodes_at_any_number_of_threads(task):
     first = record_vector(task.name, 3, threads=1)
     np.testing.assert_array_equal(first, record_vector(task.name, 3, threads=1))
@@ -125,6 +126,7 @@ def test_a_later_reset_without_seed_goes_on_with_other_starts(task):
     assert not np.array_equal(env.reset()[0], first)
 
 
+@pytest.mark.slow
 def test_the_vector_env_plays_the_episodes_of_the_single_env(task):
     starts = np.array(task.scene.starts)
     vec = make_vec(task.name, len(starts))
@@ -412,6 +414,7 @@ def test_a_copy_for_sb3_plays_on_as_the_original(vehicle):
             np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.slow
 def test_a_copy_of_a_task_from_a_file_finds_it_again(puck):
     assert type(pickle.loads(pickle.dumps(puck))) is type(puck)
     code = "import pickle, sys; print(pickle.load(sys.stdin.buffer).name)"
@@ -482,6 +485,7 @@ def test_many_episodes_draw_no_pictures(vehicle):
 # ---- pictures
 
 
+@pytest.mark.slow
 @needs_gl
 def test_a_copy_draws_its_own_pictures():
     env = make("vehicle", render_mode="rgb_array").unwrapped

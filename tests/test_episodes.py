@@ -85,6 +85,7 @@ def test_no_noise_is_worse_than_the_worst(records, on_vehicle):
         assert lost / sum(r.episodes for r in mine) <= 1 - won + 0.02
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_counts(vehicle, on_vehicle):
     sign = {"sign": on_vehicle.controllers["sign"]}
 
@@ -119,6 +120,7 @@ def test_noise_that_hides_everything_is_refused(vehicle, on_vehicle):
         noisy_episodes(vehicle, Regions(decisions(vehicle).points), sign, noises, 10)
 
 
+@pytest.mark.slow
 def test_controllers_are_compared_from_starts_that_all_win_without_noise(vehicle, on_vehicle):
     loops = {name: on_vehicle.controllers[name] for name in ("sign", "left")}
     noises = (Noise("none", 0.1), Noise("adversarial", 0.1))

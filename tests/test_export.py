@@ -155,6 +155,7 @@ def test_charts_of_more_dimensions(d, exported):
     assert_same(controller, exported(controller), random_states(cube, 2000, RNG(0)) * 1.2)
 
 
+@pytest.mark.slow
 def test_sets_on_scattered_nodes_go_to_numpy(tmp_path):
     hall = Hall()
     hall.observation_low, hall.observation_high = (-1.0,) * 6, (1.0,) * 6

@@ -144,6 +144,7 @@ def test_anything_else_is_one_sentence(text, why):
     assert "\n" not in sentence
 
 
+@pytest.mark.slow
 @given(st.text(max_size=60) | st.text("abdeinorstw()[]\"'<>=.,+-*/~ 01", max_size=40))
 def test_any_text_is_an_expression_or_refused(text):
     with contextlib.suppress(BadInput):

@@ -92,6 +92,7 @@ def test_both_sets_hold_the_set_point_with_room_for_the_noise(on_circle):
 # ---- vehicle
 
 
+@pytest.mark.slow
 @pytest.mark.first(2)
 @pytest.mark.parametrize("x", [0.0, 0.1, 0.2, 0.3, 0.4])
 def test_without_noise_the_overlap_is_what_can_still_be_won(vehicle_sets, on_vehicle, x):
@@ -99,6 +100,7 @@ def test_without_noise_the_overlap_is_what_can_still_be_won(vehicle_sets, on_veh
     assert overlap(vehicle_sets[0.0], x) == pytest.approx(min(0.3, LAST_CHANCE - x), abs=cell)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("x", [0.0, 0.05, 0.1, 0.15, 0.2])
 def test_with_noise_there_is_room_for_it(vehicle_sets, on_vehicle, x):
     # The noise acts across; the room is measured at right angles to the edge, or across.
@@ -108,11 +110,13 @@ def test_with_noise_there_is_room_for_it(vehicle_sets, on_vehicle, x):
     assert width >= max(0.1, min(0.3, LAST_CHANCE - x - 0.1 * np.sqrt(2))) - cell
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("x", [0.0, 0.2, 0.4, 0.5, 0.7])
 def test_the_overlap_is_never_narrower_than_the_noise(vehicle_sets, x):
     assert overlap(vehicle_sets[0.1], x) >= 0.1 - 2e-3
 
 
+@pytest.mark.slow
 def test_noise_on_all_coordinates_asks_for_room_along_each(vehicle, vehicle_sets):
     case = Case(vehicle.noisy_everywhere(), sign_policy(vehicle), 60, 120)
     sets, usual, eps = case.extend(0.3, 0.1), vehicle_sets[0.1], 0.1
@@ -129,12 +133,14 @@ def test_noise_on_all_coordinates_asks_for_room_along_each(vehicle, vehicle_sets
         assert np.count_nonzero(members.mask & ~ordinary.mask & ~off.mask) == 0
 
 
+@pytest.mark.slow
 def test_the_set_point_and_what_lies_behind_the_obstacle_is_in_every_set(vehicle_sets):
     z = np.array([[3.0, 0.0], [2.9, 0.1], [2.4, -0.5], [2.0, 1.0]])
     for sets in vehicle_sets.values():
         assert all(s.contains(z).all() for s in sets.sets)
 
 
+@pytest.mark.slow
 def test_the_winning_nodes_do_win(vehicle_sets):
     sets = vehicle_sets[0.1]
     nodes = sets.sets[0].grid.nodes
@@ -166,6 +172,7 @@ def sized(on_vehicle):
     return {noise: on_vehicle.extend(None, noise) for noise in (0.0, 0.1, 0.2)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [0.0, 0.1, 0.2])
 @pytest.mark.parametrize("x", [0.0, 0.1, 0.2, 0.3])
 def test_the_overlap_is_twice_the_noise_and_a_sample_where_there_is_room(
@@ -176,12 +183,14 @@ def test_the_overlap_is_twice_the_noise_and_a_sample_where_there_is_room(
     assert overlap(sized[noise], x) == pytest.approx(ideal, abs=cell)
 
 
+@pytest.mark.slow
 def test_the_horizon_is_as_long_as_it_takes(sized, on_circle):
     assert sized[0.1].horizon == pytest.approx(0.25)
     assert on_circle.extend(None, 0.1).horizon == pytest.approx(0.25)
     assert on_circle.extend(None, 0.2).horizon == pytest.approx(0.45)
 
 
+@pytest.mark.slow
 def test_where_the_overlap_cannot_be_wide_enough_the_run_says_so(sized, vehicle):
     narrow = sized[0.1].points[sized[0.1].narrow]
     room = sized[0.1].room[sized[0.1].narrow]

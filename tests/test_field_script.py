@@ -67,6 +67,7 @@ class Ahead:
         return np.tile([1.0, 0.0], (len(measured), 1)), q
 
 
+@pytest.mark.slow
 def test_outcomes_are_counted(script):
     layouts = Layouts(np.array([[[[-2.0, 0.0]]]]), np.array([[0.5]]), np.zeros((1, 2)))
     z = np.array([[-4.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [-4.0, 2.0, 0.0]])

@@ -122,6 +122,7 @@ def test_posts_without_room_between_them_are_passed_on_the_same_side():
     assert chosen((-6.0, 0.3, 0.0), apart)[0] == 1
 
 
+@pytest.mark.slow
 def test_a_row_of_posts_is_passed_on_the_side_that_was_chosen(field):
     row = [(-3.0, y, 0.35) for y in np.arange(-2.4, 2.5, 0.8)]
     for side, y in ((LEFT, 0.85), (RIGHT, -0.85), (LEFT, 0.0), (RIGHT, 0.0)):
@@ -335,6 +336,7 @@ def test_a_robot_is_driven_alone_as_among_others(field, posts):
         np.testing.assert_allclose(one_u[0], u[i], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_controller_of_fields_is_exported(field, tmp_path):
     from onnxruntime import InferenceSession
 

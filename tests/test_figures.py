@@ -502,6 +502,7 @@ def simulate_one(task, policy, z):
     return np.array([arc.z[-1] for arc in arcs])
 
 
+@pytest.mark.slow
 def test_a_notebook_shows_figures(planted_circle):
     run = planted_circle[0]
     for figure in (run.arcs()["start0", "policy"].plot(), vector_field(run)):

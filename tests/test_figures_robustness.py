@@ -101,6 +101,7 @@ def draw_curve(task, result, path=None):
     return written(figures.draw_robustness_curve(shown), path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", [CIRCLE, VEHICLE], ids=lambda task: task.name)
 def test_each_class_that_occurs_has_its_colour(tmp_path, task):
     occurring = (WON, WON_FROM_SOME, UNCLEAR)
@@ -116,6 +117,7 @@ def test_each_class_that_occurs_has_its_colour(tmp_path, task):
     assert sorted(p.name for p in path.parent.iterdir()) == ["map.pdf", "map.png"]
 
 
+@pytest.mark.slow
 def test_a_map_is_drawn_the_right_way_round(tmp_path, coarse):
     path = tmp_path / "map.png"
 
@@ -169,6 +171,7 @@ def test_the_critical_set_lies_at_its_angle(tmp_path, coarse):
     assert np.arctan2(y, x) == pytest.approx(0.75 * np.pi, abs=0.05)
 
 
+@pytest.mark.slow
 def test_each_curve_has_its_colour(tmp_path, coarse):
     path = tmp_path / "curve.png"
     figure = draw_curve(VEHICLE, game_of(("policy", "hyrl")), path)
@@ -178,6 +181,7 @@ def test_each_curve_has_its_colour(tmp_path, coarse):
         assert len(where(path, colour)) > 100
 
 
+@pytest.mark.slow
 def test_times_are_drawn_where_runs_last_for_ever(tmp_path, coarse):
     one, two = tmp_path / "one.png", tmp_path / "two.png"
     draw_curve(CIRCLE, game_of(["hyrl"]), one)
@@ -187,6 +191,7 @@ def test_times_are_drawn_where_runs_last_for_ever(tmp_path, coarse):
     assert len(where(two, HYRL)) > len(where(one, HYRL))
 
 
+@pytest.mark.slow
 def test_the_users_own_style_is_neither_used_nor_changed(tmp_path, coarse):
     names = ["hyrl"]
     draw_curve(VEHICLE, game_of(names), tmp_path / "plain.png")

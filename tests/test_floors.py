@@ -83,6 +83,7 @@ def test_what_has_no_further_periodic_coordinate_has_one_section(name):
     np.testing.assert_array_equal(cuts[0].rest, Section(task).rest)
 
 
+@pytest.mark.slow
 def test_each_section_has_the_critical_set_at_its_phase(gate, cuts, found):
     for cut, critical in zip(cuts, found, strict=True):
         assert len(critical.points) > 5
@@ -93,6 +94,7 @@ def test_each_section_has_the_critical_set_at_its_phase(gate, cuts, found):
     assert np.abs(first - later).max() > 0.3
 
 
+@pytest.mark.slow
 def test_the_marks_are_those_of_the_nearest_phase(gate, floors):
     for turns, number in ((0, 0), (0.4, 0), (0.6, 1), (7.4, 7), (7.6, 0), (8, 0), (19, 3), (-1, 7)):
         z = np.array([0.5, 0.1, -np.pi + turns * np.pi / 4])
@@ -102,6 +104,7 @@ def test_the_marks_are_those_of_the_nearest_phase(gate, floors):
     assert one.at(np.array([0.7])) is floors.floors[0]
 
 
+@pytest.mark.slow
 @needs_gl
 def test_a_replay_draws_them_anew_as_the_phase_goes_on(gate, floors):
     noise = Noise("alternating", 0.1)

@@ -70,6 +70,7 @@ class Room(gym.Env):
         return self._get_obs(), -1.0, won, False, {"is_success": won}
 
 
+@pytest.mark.slow
 @pytest.mark.first(2)
 @pytest.mark.parametrize(
     "frame",
@@ -97,6 +98,7 @@ def test_walls_are_where_the_robot_is_in_the_world(frame):
         assert task.direction(path) == [mode]
 
 
+@pytest.mark.slow
 def test_a_robot_whose_frame_is_oblique_has_no_walls():
     with pytest.raises(hyrl_mj.BadInput, match="nothing is decided"):
         hyrl_mj.from_gymnasium(lambda: Room(turn=30), steps=40)
@@ -139,6 +141,7 @@ def both(angle):
     return np.cos(angle), np.sin(angle)
 
 
+@pytest.mark.slow
 @pytest.mark.first(1)
 @pytest.mark.parametrize(
     ("seen", "won", "periodic"),

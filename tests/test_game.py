@@ -200,6 +200,7 @@ def test_where_nothing_can_be_won_nothing_is_won(on_vehicle, monkeypatch):
     assert game.margin("ideal") < 0.06
 
 
+@pytest.mark.slow
 def test_every_start_is_won_or_lost_and_no_more_are_won_under_more_noise(on_vehicle):
     game = on_vehicle
     for name in game.controllers:
@@ -411,6 +412,7 @@ def test_a_single_part_leaves_nothing_to_decide(vehicle):
 # ---- the limit: its score
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["vehicle", "circle"])
 def test_the_limit_wins_what_is_winnable_and_no_planted_controller_beats_it(name, request):
     game = request.getfixturevalue(f"on_{name}")

@@ -126,6 +126,7 @@ def split():
     return {make: Split(make()) for make in (three_ways, four_ways)}
 
 
+@pytest.mark.slow
 @JUNCTIONS
 def test_the_sets_hold_their_parts_and_two_bounds_more_where_they_meet(split, make):
     case, task = split[make], split[make].task
@@ -143,12 +144,14 @@ def test_the_sets_hold_their_parts_and_two_bounds_more_where_they_meet(split, ma
     assert "change over" not in case.sets.sentence(task)
 
 
+@pytest.mark.slow
 @JUNCTIONS
 def test_the_sets_that_were_found_do_not_chatter_either(split, make):
     case = split[make]
     assert not cycles(case.task.controller(case.sets.sets), around(case.task, 4 * EPS), EPS).any()
 
 
+@pytest.mark.slow
 @JUNCTIONS
 def test_neighbours_meet_along_their_edge_and_all_in_the_junction(split, make):
     case, task = split[make], split[make].task

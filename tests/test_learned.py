@@ -48,6 +48,7 @@ def test_a_run_stops_where_stage_1_has_not_learned_unless_told_to_go_on(
     assert after[0] == "critical-set"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("minutes", "before", "trainings"), [(60, 0, 2), (60, 800, 2), (60, 990, 1), (1e-9, 0, 1)]
 )
@@ -193,6 +194,7 @@ def test_a_second_obstacle_of_the_template_is_a_crash_and_a_forgotten_one_is_tol
     assert bool(said) == forgotten
 
 
+@pytest.mark.slow
 def test_no_task_of_the_package_overlooks_an_obstacle_or_jumps_over_it():
     tasks = [hyrl_mj.get_task(name) for name in hyrl_mj.task_names()]
     own = [task for task in tasks if task.source is None]
@@ -238,6 +240,7 @@ def test_what_is_thinner_than_a_sample_leads_is_told(vehicle, monkeypatch, end, 
     assert bool(re.search(r"jumps over .* from x = 2\.1", jumped_over(vehicle))) == jumps
 
 
+@pytest.mark.slow
 def test_a_set_point_that_noise_hides_is_told_with_what_would_do(circle):
     """It moves by 0.05 rad in a sample: beside the set-point it may be by 0.1 rad of noise and that."""
 
@@ -261,6 +264,7 @@ def test_a_set_point_that_noise_hides_is_told_with_what_would_do(circle):
     assert not hidden_goal(circle, 0.1)
 
 
+@pytest.mark.slow
 def test_a_robot_with_inertia_moves_from_rest_at_its_set_point(puck):
     """Elsewhere it moves by up to 0.05 m in a sample."""
     slow = type("Slow", (type(puck),), {"close": 0.13, "ending": at_no_end})

@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 from planted import ChartPolicy, halves, pass_on, sign_policy
 
 from hyrl_mj import simulate
@@ -34,6 +35,7 @@ def grazing_policy(task):
     return ChartPolicy(task, lambda z: pass_on(1.0, z[:, 1], 0.76))
 
 
+@pytest.mark.slow
 def test_a_policy_that_only_cannot_decide_is_cured_by_hysteresis(vehicle):
     policy = sign_policy(vehicle)
     losses = sorted_losses(vehicle, policy)

@@ -84,6 +84,7 @@ def shown():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["overview", "policy", "extended_sets", "runs"])
 def test_words_do_not_lie_over_each_other(shown, name):
     figure = figures.FIGURES[name].draw(shown)

@@ -130,6 +130,7 @@ def moved(task, samples=7, n=N, threads=0):
     return plant
 
 
+@pytest.mark.slow
 def test_the_task_can_be_used(swing):
     assert check_task(swing) is swing
     assert swing.kinematic
@@ -284,6 +285,7 @@ def by_row(self, qpos):
     return np.tile(np.arange(len(qpos))[:, None, None] * 0.1, (1, 2, 3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "mocap", "said"),
     [

@@ -82,6 +82,7 @@ def test_what_does_not_begin_leaves_what_others_have_put_there_and_nothing_else(
     assert os.listdir(tmp_path / "empty") == []
 
 
+@pytest.mark.slow
 def test_the_folder_of_another_process_that_is_at_work_stays(tmp_path, monkeypatch):
     folder = tmp_path / "sweep"
     with locked(folder):
@@ -194,6 +195,7 @@ def test_code_that_a_file_names_is_not_even_read(tmp_path, monkeypatch):
     assert len(digest_of(path)) == 64
 
 
+@pytest.mark.slow
 def test_a_session_in_a_folder_of_a_stranger_takes_no_package_from_it(tmp_path):
     for name in ("gymnasium_robotics", "ogbench", "shimmy", "evil_task"):
         (tmp_path / f"{name}.py").write_text("open('executed', 'w').close()")
@@ -346,6 +348,7 @@ def test_a_run_in_a_folder_that_is_not_in_utf_8_is_reported(planted_circle, tmp_
 # ---- what lies in the way
 
 
+@pytest.mark.slow
 def test_a_matplotlibrc_of_the_current_folder_has_no_part(tmp_path):
     code = "from hyrl_mj.system.gl import spare_matplotlib; spare_matplotlib()\n"
     code += (
@@ -406,6 +409,7 @@ def test_an_array_holds_numbers():
             making.from_spec(spec)
 
 
+@pytest.mark.slow
 def test_arguments_have_a_length():
     with pytest.raises(BadInput, match="take more than 1,048,576 characters"):
         from_gymnasium(ENV, pinned={f"k{i}": 1 for i in range(200_000)})
@@ -455,6 +459,7 @@ def test_arguments_of_an_environment_have_a_limit(size, message, tmp_path):
         chosen_task(None, options)
 
 
+@pytest.mark.slow
 def test_a_model_that_is_large_is_refused(tmp_path):
     write_task("big", tmp_path)
     path = tmp_path / "big.xml"

@@ -110,6 +110,7 @@ def test_a_deviation_that_is_no_third_of_the_bound_is_said(of):
     assert f" sigma {noise.sigma:.3g}" in noise.text
 
 
+@pytest.mark.slow
 def test_the_worst_of_each_quantity_is_given_for_all(tmp_path):
     a, b = planted(0, 0.05, uniform=0.02, delay=2), planted(1, 0.05, uniform=0.05, bias=0.1)
     log = a | {"y": b["x"], "y_ref": b["x_ref"]}
@@ -148,6 +149,7 @@ def test_other_units_are_named_and_scaled(of):
     assert of(late | {"x": -late["x"]}, scale={"x": -1}).delay == 2
 
 
+@pytest.mark.slow
 def test_times_in_milliseconds_are_asked_about_and_not_played(tmp_path):
     log = planted(0, 0.005, uniform=0.05, seconds=60)
     log["t"] *= 1000
@@ -231,6 +233,7 @@ def test_numbers_of_any_size_are_taken(of):
 # ---- the command, and files of strangers
 
 
+@pytest.mark.slow
 def test_the_command_draws_and_does_not_overwrite(tmp_path):
     path = write(tmp_path / "log.csv", planted(0, 0.05, uniform=0.05, drift=(0.05, 0.01)))
     assert call("noise", path, cwd=tmp_path).returncode == 0
@@ -527,6 +530,7 @@ def test_held_samples_are_not_guessed_where_steps_are_uneven(of):
     assert "x is rounded in uneven steps" in str(noise.remarks)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [5, 40])
 def test_a_delay_is_found_in_a_log_of_a_high_rate(delay, of):
     """Of which the next sample is hardly another."""

@@ -41,6 +41,7 @@ def test_an_error_of_its_own_is_not_taken_for_an_unknown_attribute(run, monkeypa
         _ = run.broken
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", figures.FIGURES)
 def test_it_draws_its_figures(run, name):
     assert isinstance(run.plot(name), Figure)
@@ -92,6 +93,7 @@ def test_episodes_and_attacks_are_rows_of_the_table():
     assert np.isnan(row["lost"]), "what never arrives is not called unbroken"
 
 
+@pytest.mark.slow
 @needs_gl
 def test_its_replay_is_shown_by_a_notebook_and_saved(run, tmp_path):
     replay = run.replay(np.array([[3.0], [3.2]]), "uniform", size=(480, 160), fps=1)

@@ -59,6 +59,7 @@ def function(name, *nodes, domain="mine"):
     return helper.make_function(domain, name, ["a"], ["r"], list(nodes), opsets)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("nodes", "constants", "operator"),
     [
@@ -85,6 +86,7 @@ def test_an_operator_that_a_policy_does_not_need_is_named(
     refused(path, circle, f"its operator {operator} .*in Python, give a function of your own")
 
 
+@pytest.mark.slow
 def test_operators_inside_local_functions_are_seen(circle, tmp_path):
     draws = function("F", node("RandomNormalLike", "a", "x"), node("Add", "a x", "r"))
     outer = function("G", node("F", "a", "r", domain="mine"))
@@ -114,6 +116,7 @@ def test_functions_that_call_each_other_without_end_are_refused(circle, tmp_path
     refused(path, circle, "cannot be read")
 
 
+@pytest.mark.slow
 def test_a_model_is_read_as_it_was_examined(circle, tmp_path):
     """onnxruntime takes a file with these letters for one of its own, with any operators."""
     path = saved(tmp_path, [node("Tanh", "g")])
@@ -124,10 +127,12 @@ def test_a_model_is_read_as_it_was_examined(circle, tmp_path):
     ).all()
 
 
+@pytest.mark.slow
 def test_a_model_without_outputs_is_refused(circle, tmp_path):
     refused(saved(tmp_path, [], outputs=()), circle, "it gives no output")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [2**27, 2**34, 2**60])
 def test_a_model_that_needs_much_memory_is_refused(size, circle, tmp_path):
     sums = [
@@ -154,6 +159,7 @@ def test_a_model_that_takes_long_is_refused(circle, tmp_path, monkeypatch):
     refused(saved(tmp_path, chain, constants), circle, "it takes longer than 1 s")
 
 
+@pytest.mark.slow
 def test_sizes_that_depend_on_the_observation_are_refused(circle, tmp_path):
     count = [node("ReduceSum", "g", "s", keepdims=0), node("Cast", "s", "c", to=INT)]
     constants = [tensor("Z", np.int64(0)), tensor("E", np.int64(1))]
@@ -168,6 +174,7 @@ def test_operators_that_stand_in_another_order_are_refused(circle, tmp_path):
     refused(saved(tmp_path, nodes), circle, "Expand stands before what it takes is computed")
 
 
+@pytest.mark.slow
 def test_sizes_that_depend_on_the_number_of_observations_are_taken(circle, tmp_path):
     nodes = [node("Shape", "g", "s"), node("ConstantOfShape", "s", "z"), node("Add", "g z")]
     policy = load_agent(saved(tmp_path, nodes), circle)
@@ -176,6 +183,7 @@ def test_sizes_that_depend_on_the_number_of_observations_are_taken(circle, tmp_p
     np.testing.assert_allclose(policy.inputs(observation), expected, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_only_numbers_of_rows_that_were_tried_are_run(circle, tmp_path):
     """A model that would take 8 GiB for batches of two rows, and for no others, never sees one."""
     nodes = [
@@ -197,12 +205,14 @@ def test_only_numbers_of_rows_that_were_tried_are_run(circle, tmp_path):
     assert memory.megabytes < 1024
 
 
+@pytest.mark.slow
 def test_an_answer_that_depends_on_other_observations_is_refused(circle, tmp_path):
     nodes = [node("ReduceMean", "g A", "m", keepdims=1), node("Sub", "g m")]
     path = saved(tmp_path, nodes, [tensor("A", np.array([0]))])
     refused(path, circle, "depends on the other observations of the batch")
 
 
+@pytest.mark.slow
 def test_numbers_in_other_files_are_refused(circle, tmp_path):
     (tmp_path / "secret").write_bytes(np.ones(2, np.float32).tobytes())
     outside = tensor("w", np.ones((1, 2), np.float32))
@@ -222,6 +232,7 @@ def test_numbers_in_other_files_are_refused(circle, tmp_path):
     refused(path, circle, message)
 
 
+@pytest.mark.slow
 def test_a_large_file_of_nothing_is_refused(circle, tmp_path):
     path = tmp_path / "a.onnx"
     path.write_bytes(bytes(2**25 + 1))
@@ -231,6 +242,7 @@ def test_a_large_file_of_nothing_is_refused(circle, tmp_path):
     refused(path, circle, "200 MB|operator")
 
 
+@pytest.mark.slow
 def test_the_models_of_exporters_are_taken(circle, vehicle, tmp_path):
     torch = pytest.importorskip("torch")
     for task, outputs in ((circle, 1), (vehicle, 5)):

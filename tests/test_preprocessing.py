@@ -144,6 +144,7 @@ def as_there(model, wrapped, task, measured):
     return np.array(answers)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("algorithm", "name", "wrapped"),
     [
@@ -164,6 +165,7 @@ def test_in_a_closed_loop_it_acts_as_under_sb3(algorithm, name, wrapped, tmp_pat
             np.testing.assert_allclose(arc.u[:-1], theirs, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_statistics_of_what_a_wrapper_made_are_refused(circle, tmp_path):
     inside = gym.wrappers.NormalizeObservation(gym.make(circle.env_id))
     for inner in (TaskVecEnv(BatchedEnv(circle, 1)), DummyVecEnv([lambda: inside])):
@@ -196,6 +198,7 @@ def test_its_steady_answer_is_that_to_an_unchanged_measurement(vehicle, tmp_path
     np.testing.assert_array_equal(steady.act(measured), policy.act(measured))
 
 
+@pytest.mark.slow
 def test_a_sampled_agent_is_normalised_too(circle, tmp_path):
     _, path, needs = agent(PPO, circle, tmp_path, WRAPPED["normalised"])
     drawn = load_agent(path, circle, stochastic=True, **needs)
@@ -207,6 +210,7 @@ def test_a_sampled_agent_is_normalised_too(circle, tmp_path):
     np.testing.assert_array_equal(as_function(drawn).act(measured), mean.act(measured))
 
 
+@pytest.mark.slow
 def test_onnx_models_are_normalised_and_stacked(circle, tmp_path):
     weight = np.random.default_rng(0).normal(size=(1, 6))
     path = onnx_file(tmp_path, weight, np.zeros(1))
@@ -344,6 +348,7 @@ def test_options_of_files_are_not_taken_for_functions(circle):
             read_agent(circle, lambda o: o[:, :1], **options)
 
 
+@pytest.mark.slow
 def test_its_network_is_not_taken_for_one_on_plain_observations(circle, tmp_path):
     _, path, needs = agent(PPO, circle, tmp_path, WRAPPED["normalised"])
     loaded = load_agent(path, circle, **needs)

@@ -61,6 +61,7 @@ def test_a_share_of_the_episodes_starts_anywhere_outside_obstacles(field):
     assert elsewhere[:, 0].max() > 3.8, "the whole chart"
 
 
+@pytest.mark.slow
 def test_many_of_these_start_where_the_latest_policy_lost(field):
     drawn = rehearsal_of(field, 1.0)
     rng = np.random.default_rng(0)
@@ -73,6 +74,7 @@ def test_many_of_these_start_where_the_latest_policy_lost(field):
     assert in_front(drawn.starts(20_000, rng)).mean() < usual, "only the last policy counts"
 
 
+@pytest.mark.slow
 def test_many_of_these_start_where_the_latest_policy_goes_two_ways(field):
     drawn = rehearsal_of(field, 1.0)
     rng = np.random.default_rng(0)
@@ -90,6 +92,7 @@ def test_many_of_these_start_where_the_latest_policy_goes_two_ways(field):
     assert decides_there(drawn.starts(20_000, rng)).mean() < usual + 0.02, "only the last policy"
 
 
+@pytest.mark.slow
 def test_what_is_lost_late_is_rehearsed_more_often(field):
     drawn = rehearsal_of(field, 1.0)
     drawn.update(straight(field))
@@ -99,6 +102,7 @@ def test_what_is_lost_late_is_rehearsed_more_often(field):
     assert far.sum() > 1.5 * close.sum()
 
 
+@pytest.mark.slow
 def test_a_policy_that_wins_everything_leaves_nothing_to_rehearse(field):
     field = Field({"": (9, 9, 0.1)})
     drawn = rehearsal_of(field, 0.5)

@@ -184,6 +184,7 @@ def test_without_gl_one_message_says_what_to_install(backend):
     assert "Traceback" not in child.stderr
 
 
+@pytest.mark.slow
 @needs_gl
 def test_who_imports_mujoco_first_gets_pictures_too():
     code = (
@@ -198,6 +199,7 @@ def test_who_imports_mujoco_first_gets_pictures_too():
     assert child.stdout == "True\n", child.stderr
 
 
+@pytest.mark.slow
 @needs_gl
 def test_shadows_are_no_finer_than_the_picture_and_fall_where_they_did():
     text = """

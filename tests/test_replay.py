@@ -137,6 +137,7 @@ def test_the_video_plays_both_arcs_in_real_time(tmp_path, show):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["replay.mp4", "replay.png"]
 
 
+@pytest.mark.slow
 @needs_gl
 def test_around_a_jump_it_is_slower(tmp_path, show):
     path = tmp_path / "replay.mp4"
@@ -153,6 +154,7 @@ def test_long_runs_have_fewer_frames_a_second(seconds, fps):
     assert ReplayOptions(size=SIZE).lasting(seconds) == ReplayOptions(size=SIZE, fps=fps)
 
 
+@pytest.mark.slow
 def test_a_gif_has_as_many_frames_and_a_picture_is_the_last(tmp_path, show):
     render_replay(TASK, [show], tmp_path / "replay.gif", ReplayOptions(size=SIZE, fps=FPS))
     with Image.open(tmp_path / "replay.gif") as film:
@@ -183,6 +185,7 @@ def test_an_overlay_has_both_paths_in_one_scene(tmp_path, show):
 # ---- the scene
 
 
+@pytest.mark.slow
 @needs_gl
 def test_the_path_has_the_colours_of_its_modes(crash, jump):
     picture, pixel = drawn([Track(TASK, jump)], 3.0)
@@ -204,6 +207,7 @@ def test_the_path_has_the_colours_of_its_modes(crash, jump):
     assert near(policy[line - 3 : line + 4, column - 3 : column + 4], BAD).sum() > 5, "its end, too"
 
 
+@pytest.mark.slow
 @needs_gl
 @pytest.mark.parametrize("camera", ["overhead", "chase", "three_quarter"])
 def test_frames_do_not_depend_on_those_before(crash, jump, camera):
@@ -215,6 +219,7 @@ def test_frames_do_not_depend_on_those_before(crash, jump, camera):
     assert differ.sum() <= 20
 
 
+@pytest.mark.slow
 @needs_gl
 def test_a_path_beyond_what_the_camera_shows_is_in_the_picture(jump):
     far = Track(TASK, jump)
@@ -225,6 +230,7 @@ def test_a_path_beyond_what_the_camera_shows_is_in_the_picture(jump):
     assert 0 <= pixel(far.points).min() <= pixel(far.points).max() <= 320
 
 
+@pytest.mark.slow
 @needs_gl
 def test_nothing_is_left_where_a_capsule_was(jump):
     """It is longer than its numbers tell."""
@@ -252,6 +258,7 @@ def test_nothing_is_left_where_a_capsule_was(jump):
     assert (np.abs(pictures[0] - pictures[1]).max(axis=-1) > 2).sum() <= 20
 
 
+@pytest.mark.slow
 @needs_gl
 def test_the_measured_robot_is_a_ghost_within_the_bound():
     arc = jumping_arc(q0=0, noise=NOISE)
@@ -289,6 +296,7 @@ def test_a_mark_is_no_geom_of_the_model_that_was_drawn_in_its_place():
     assert scene.geoms[0].objtype == mujoco.mjtObj.mjOBJ_UNKNOWN
 
 
+@pytest.mark.slow
 @needs_gl
 def test_critical_set_and_overlap_lie_on_the_floor(jump):
     grid = Grid.with_cells(TASK.chart, 120)
@@ -455,6 +463,7 @@ def test_impossible_wishes_are_refused(tmp_path, show, name, options, message):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 @needs_gl
 def test_without_a_video_there_is_no_poster(tmp_path, show, monkeypatch):
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(tmp_path / "ffmpeg"))

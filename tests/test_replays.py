@@ -75,6 +75,7 @@ def delayed(samples):
     return Late()
 
 
+@pytest.mark.slow
 def test_an_honest_plant_keeps_what_is_proved(certificate, loops, scores):
     assert scores["hyrl"][-1].proved > 0.99
     (count,) = examination._replays(certificate, scores)
@@ -83,6 +84,7 @@ def test_an_honest_plant_keeps_what_is_proved(certificate, loops, scores):
     assert (count.failures, count.judged, count.is_whole) == (0, 440 // 20, True)
 
 
+@pytest.mark.slow
 def test_a_plant_that_lags_behind_what_was_proved_of_it_loses_the_word(certificate, loops, scores):
     certificate.game.task = delayed(3)  # what was proved is true of another plant
     (count,) = examination._replays(certificate, scores)
@@ -95,6 +97,7 @@ def test_a_plant_that_lags_behind_what_was_proved_of_it_loses_the_word(certifica
     assert Outcome(run.outcome[0]).label == first.outcome != "reached"
 
 
+@pytest.mark.slow
 def test_a_proof_of_everything_is_refuted(vehicle, monkeypatch):
     """From one side to the other no policy can change in front of the pillar."""
     lost = {"hyrl": ideal_controller(vehicle, overlap=0.6)}
@@ -113,6 +116,7 @@ def test_a_proof_of_everything_is_refuted(vehicle, monkeypatch):
     assert count.first.outcome == "crashed"
 
 
+@pytest.mark.slow
 def test_starts_that_are_won_are_replayed_where_nothing_is_proved(vehicle):
     """Of policies that are no networks nothing is proved."""
     loops = {"hyrl": ideal_controller(vehicle), "policy": PolicyController(one_way_policy(vehicle))}
@@ -316,11 +320,13 @@ def test_a_run_of_such_a_task_is_refused_before_it_trains(kind, tmp_path, monkey
     assert not (tmp_path / "run" / "policy.safetensors").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["vehicle", "beam", "field"])
 def test_the_tasks_of_this_package_are_simulated_as_plain_mujoco_does(name):
     assert judge_task(hyrl_mj.get_task(name)) == 50
 
 
+@pytest.mark.slow
 def test_every_examination_by_episodes_is_judged(puck, monkeypatch):
     from hyrl_mj.judging import Regions, episodes, noisy_episodes
 

@@ -58,6 +58,7 @@ def test_a_controller_that_fails_is_said_to_fail():
     )
 
 
+@pytest.mark.slow
 def test_sets_by_the_papers_horizon_need_no_note():
     circle = hyrl_mj.get_task("unit_circle")
     found = table_of(script.circle_lines(planted_run(circle, horizon=0.5)))

@@ -116,6 +116,7 @@ def test_the_curve_takes_more_cells_where_a_sample_is_too_short_for_its_own(vehi
     assert curve_grid(vehicle, 120).counts == (121, 121)
 
 
+@pytest.mark.slow
 def test_stage_6_asks_episodes_where_two_inputs_do_not_fit(monkeypatch):
     plane = Cube(lambda z: z[:, 0], d=2)
     plane.start_low, plane.start_high = (-0.5, -0.5), (0.5, 0.5)
@@ -167,6 +168,7 @@ class Docked(Course):
         return np.where(docked, 0.0, super().control(u, qpos, qvel))
 
 
+@pytest.mark.slow
 def test_inputs_that_an_inner_loop_bends_are_tabulated_in_between():
     course = Course()
     lattice = Lattice.tabulate(course, lattice_grid(course, 60))
@@ -174,6 +176,7 @@ def test_inputs_that_an_inner_loop_bends_are_tabulated_in_between():
     assert np.ptp(lattice.hops, axis=0).min() > 0.09, "it goes every way"
 
 
+@pytest.mark.slow
 def test_an_inner_loop_that_depends_on_the_place_is_tabulated_everywhere():
     docked = Docked()
     lattice = Lattice.tabulate(docked, lattice_grid(docked, 80))
@@ -183,6 +186,7 @@ def test_an_inner_loop_that_depends_on_the_place_is_tabulated_everywhere():
     assert stays[held].all()
 
 
+@pytest.mark.slow
 def test_nothing_is_proved_of_a_robot_with_an_inner_loop():
     course = Course()
     with pytest.raises(Unbounded, match="an inner loop"):
@@ -211,6 +215,7 @@ def test_a_robot_whose_inner_loop_gives_speeds_runs_backward(unicycle):
 # ---- three dimensions
 
 
+@pytest.mark.slow
 def test_samples_are_rounded_to_nodes_around_their_ends_and_right_on_average(rough):
     assert rough.estimate
     assert not rough.exact
@@ -226,6 +231,7 @@ def test_samples_are_rounded_to_nodes_around_their_ends_and_right_on_average(rou
     assert (np.abs(off).mean(axis=0) > 0.1 * rough.grid.spacing)[:2].all()
 
 
+@pytest.mark.slow
 def test_noise_is_rounded_to_whole_cells_and_never_to_none(rough):
     _, y, heading = rough.grid.spacing
     assert nodes_within(rough, np.array([0.0, 2.6 * y, 0.3 * heading])).tolist() == [0, 3, 1]
@@ -252,6 +258,7 @@ def test_the_estimate_agrees_with_runs_of_the_plant(unicycle):
     assert lost > 0.5 * (won.mean() - (game.value("policy", 0.1)[-1, starts] < NEVER).mean()) > 0.05
 
 
+@pytest.mark.slow
 def test_in_three_dimensions_nothing_is_proved_and_only_what_was_tried_is_not_broken(monkeypatch):
     spare(monkeypatch, nodes=60)
     cube = Cube(lambda z: z[:, 0])
@@ -296,6 +303,7 @@ def planned(name):
     return Run(Path("nowhere"), preset(hyrl_mj.get_task(name)))
 
 
+@pytest.mark.slow
 def test_a_map_is_cut_to_the_section_that_is_drawn(unicycle, rough):
     section = Section(unicycle)
     heading = np.round(rough.grid.nodes[:, 2] / rough.grid.spacing[2]).astype(np.int8)

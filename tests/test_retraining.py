@@ -86,6 +86,7 @@ def discounted(circle, domain, start, u, gamma=0.95):
     return total
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("eps", [0.05, 0.29])
 def test_it_pays_to_go_back_from_the_farthest_edge(circle, eps):
     parts, sets = circle_sets(circle, eps)
@@ -97,6 +98,7 @@ def test_it_pays_to_go_back_from_the_farthest_edge(circle, eps):
     assert back > stay + 0.5
 
 
+@pytest.mark.slow
 def test_only_in_its_part_does_a_mode_earn_the_reward_of_the_task(circle):
     parts, sets = circle_sets(circle, 0.25)
     here, beyond, common = np.pi - 1.0, np.pi + 0.5, 0.1
@@ -178,6 +180,7 @@ def test_the_judge_prefers_a_policy_that_loses_nothing(vehicle, left):
     assert len(lost_by(left))
 
 
+@pytest.mark.slow
 def test_where_runs_end_is_judged_as_they_are_simulated(vehicle, left):
     wide = one_way_policy(vehicle, 1.0, clear=1.01)
     # Runs from between two samples' ways end half a sample behind the set-point.
@@ -244,6 +247,7 @@ def untrained(vehicle, quick):
     return training.export(training.build(vehicle, quick, seed=0), vehicle)
 
 
+@pytest.mark.slow
 def test_a_mirror_image_that_will_do_is_taken(vehicle, vehicle_sets, quick, monkeypatch):
     other = untrained(vehicle, quick)
     image = symmetry.mirrored(other)

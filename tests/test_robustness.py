@@ -114,6 +114,7 @@ def test_a_margin_that_nothing_tried_exceeds_is_at_least_that(vehicle):
 # ---- the time of an episode
 
 
+@pytest.mark.slow
 def test_won_is_what_arrives_before_the_episode_ends(circle, monkeypatch):
     monkeypatch.setattr(examination, "CURVE", CURVE[::8])
 
@@ -195,6 +196,7 @@ def test_the_map_s_classes_are_those_of_the_starts(vehicle, on_vehicle):
     np.testing.assert_array_equal(game.map("sign", 0.1) == OVER, ~game.lattice.running)
 
 
+@pytest.mark.slow
 def test_where_samples_end_between_nodes_a_map_calls_lost_what_is_lost_on_the_plant(circle):
     """A slow policy goes half a cell in a sample: by rounding, the adversary of the game can hold it."""
     quick = circle_policy(circle)
@@ -289,6 +291,7 @@ def examined(request, on_vehicle, on_circle):
     return task, named, result, maps
 
 
+@pytest.mark.slow
 def test_an_examination_holds_what_the_game_says(examined):
     task, named, result, maps = examined
     grid = Grid.with_cells(task.chart, CELLS[task.name])
@@ -309,6 +312,7 @@ def test_an_examination_holds_what_the_game_says(examined):
     assert result.lattice.spacing == tuple(grid.spacing.tolist())
 
 
+@pytest.mark.slow
 def test_the_curve_starts_at_no_noise_and_only_falls_for_the_policy(examined):
     _, _, result, _ = examined
     curve = result.curve
@@ -320,6 +324,7 @@ def test_the_curve_starts_at_no_noise_and_only_falls_for_the_policy(examined):
     assert curve.wins[LIMIT].won == (1.0,) * len(curve.eps)
 
 
+@pytest.mark.slow
 def test_the_profile_says_how_much_noise_each_point_of_the_critical_set_bears(examined):
     task, _, result, _ = examined
     profile, points = result.profile, decisions(task).points
@@ -332,6 +337,7 @@ def test_the_profile_says_how_much_noise_each_point_of_the_critical_set_bears(ex
     assert set(profile.eps[LIMIT]) == {result.curve.eps[-1]}
 
 
+@pytest.mark.slow
 def test_an_examination_survives_being_written(examined, tmp_path):
     _, _, result, _ = examined
     robustness = Robustness(0.1, False, result, (), seed=0)

@@ -82,6 +82,7 @@ np.save({out!r}, u)
 """
 
 
+@pytest.mark.slow
 def test_a_saved_policy_works_without_torch(task, tmp_path):
     policy = export(build(task, preset(task, "smoke").stage1, seed=0), task)
     policy.save(tmp_path / "p.safetensors")
@@ -111,6 +112,7 @@ except SystemExit:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("code", "heavy"), [("import hyrl_mj", HEAVY | {"tyro"}), (HELP, HEAVY)], ids=["import", "help"]
 )

@@ -82,6 +82,7 @@ def test_a_seed_gives_both_the_same_random_noise(task, loop):
     assert np.abs(own - simulated_returns(task, loop, z, UNIFORM, 8)[0]).max() > 0.01
 
 
+@pytest.mark.slow
 def test_the_mean_under_random_noise_is_that_of_the_simulation(task):
     loop = controller_of(task)
     env = TaskVecEnv(BatchedEnv(task, 100, noise=UNIFORM))

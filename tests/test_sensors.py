@@ -129,6 +129,7 @@ def test_a_quantum_rounds_the_noisy_columns():
     assert np.array_equal(run.measured[:, :, 0], run.true[:-1, :, 0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["rover", "quadrotor"])
 def test_what_robots_with_inertia_move_while_a_sensor_is_late_is_allowed_for(name):
     """Also where all inputs are in their middle, so that it goes straight on as fast as it can."""
@@ -140,6 +141,7 @@ def test_what_robots_with_inertia_move_while_a_sensor_is_late_is_allowed_for(nam
     assert run.length.max() > 20
 
 
+@pytest.mark.slow
 def test_a_turn_is_no_jump():
     assert np.abs(played("delay 1", task=CIRCLE, steps=150)[0]).max() <= 0.05 + 1e-9
 

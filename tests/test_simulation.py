@@ -80,6 +80,7 @@ def cases(circle, vehicle):
     ]
 
 
+@pytest.mark.slow
 def test_it_equals_the_formula_one_by_one(circle, vehicle):
     for task, controller, starts in cases(circle, vehicle):
         q0 = np.zeros(len(starts), dtype=int)
@@ -204,6 +205,7 @@ def test_the_horizon_cuts_an_arc(circle):
     assert arc.outcome == "stalled"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["uniform", "adversarial", "worst", "attack"])
 def test_some_runs_may_have_a_start_mode_and_others_pick_theirs(vehicle, kind):
     loop = ideal_controller(vehicle)
@@ -242,6 +244,7 @@ class Phase(UnitCircle):
         return np.arctan2(np.sin(sensors), np.cos(sensors))
 
 
+@pytest.mark.slow
 def test_a_phase_that_passes_pi_is_not_wrapped_either(circle):
     phase, policy = Phase(), circle_policy(circle, critical=2.0)
     plain, arc = (simulate(task, policy, 2.5, horizon=3.0) for task in (circle, phase))
@@ -277,6 +280,7 @@ def test_a_short_repr_says_how_it_ended(jumping_arc, circle):
     assert repr(arc) == "HybridArc(unit_circle, policy: reached after 0.10 s, 0 jumps, no noise)"
 
 
+@pytest.mark.slow
 def test_a_plot_shows_every_coordinate_by_mode_and_marks_the_jumps(jumping_arc, vehicle, tmp_path):
     figure = jumping_arc.plot()
     assert [panel.get_ylabel() for panel in figure.axes] == ["x [m]", "y [m]"]

@@ -494,6 +494,7 @@ def test_a_machine_that_keeps_its_files_is_told_of(tmp_path):
     assert "share" in kept.sentence
 
 
+@pytest.mark.slow
 def test_a_run_directory_that_is_held_is_waited_for(monkeypatch, tmp_path):
     from hyrl_mj.files.manifest import Busy
 

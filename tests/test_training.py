@@ -151,6 +151,7 @@ def test_it_goes_on_from_a_policy(task):
 # ---- returns
 
 
+@pytest.mark.slow
 def test_evaluation_of_a_known_policy(circle, monkeypatch):
     """A policy that never moves: 150 times the reward of its start, or the discounted sum."""
     policy = untrained(circle)
@@ -188,6 +189,7 @@ def rewards_seen(task, settings):
     return np.array([env.step(action)[1] for action in actions])[200:]
 
 
+@pytest.mark.slow
 def test_normalised_rewards_do_not_depend_on_the_unit_of_the_reward(vehicle, monkeypatch):
     settings = replace(preset(vehicle).stage1, envs=16, normalize=True)
     plain = rewards_seen(vehicle, replace(settings, normalize=False))

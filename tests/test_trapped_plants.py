@@ -310,6 +310,7 @@ def test_starts_properties_and_models_that_are_not_the_same_are_refused(
         check_task(task_of(methods(vehicle(), code), tmp_path))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("other", ["hash('wall') % 1_000 / 1_000", "0.0"])
 def test_what_another_process_computes_otherwise_is_refused(tmp_path, other):
     robot = vehicle()

@@ -80,6 +80,7 @@ def test_an_object_that_no_run_leads_to_is_refused(wide, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "value"), [("max_steps", 30), ("noisy", (1, 1)), ("close", 0.9)])
 def test_a_class_that_was_changed_after_its_file_was_executed_is_refused(
     name, value, tmp_path, monkeypatch
@@ -94,6 +95,7 @@ def test_a_class_that_was_changed_after_its_file_was_executed_is_refused(
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_a_module_beside_a_task_that_was_changed_in_memory_is_refused(tmp_path):
     (tmp_path / "poles.py").write_text("RADIUS = 0.6\n")
     ending = PY["ending"].replace(CRASH, "<= poles.RADIUS]")
@@ -253,6 +255,7 @@ def test_a_model_that_no_file_holds_is_no_robot_of_a_run(tmp_path):
         check_task(get_task(path))
 
 
+@pytest.mark.slow
 def test_the_digest_of_a_task_is_the_same_in_each_process(tmp_path):
     names = [f"part_{i}" for i in range(8)]
     for name in names:
@@ -534,6 +537,7 @@ def test_a_mode_does_not_stay_where_its_set_is_no_number(vehicle):
         controller.step(np.zeros(1, dtype=int), np.array([[1.5, -0.9]]))
 
 
+@pytest.mark.slow
 def test_functions_that_differ_away_from_the_starts_are_told_apart(vehicle):
     def near(seen):
         return np.full(len(seen), 2)

@@ -100,6 +100,7 @@ def robot(tmp_path):
     return write_task("robot_of_mine", tmp_path)[0]
 
 
+@pytest.mark.slow
 def test_a_task_file_that_the_user_has_named_is_known_until_it_changes(robot):
     assert not trust.is_known(robot)
     code = f"import hyrl_mj; hyrl_mj.get_task({str(robot)!r})"

@@ -140,6 +140,7 @@ def page_of(port, **options):
     return connect(f"ws://127.0.0.1:{port}", subprotocols=kind, max_size=None, **options)
 
 
+@pytest.mark.slow
 def test_the_page_is_served_to_this_machine_alone(vehicle, arc, headless, capsys, caplog):
     from websockets.exceptions import InvalidStatus
 
@@ -176,6 +177,7 @@ def test_the_page_is_served_to_this_machine_alone(vehicle, arc, headless, capsys
         socket.create_connection(("127.0.0.1", port), timeout=5)
 
 
+@pytest.mark.slow
 def test_who_has_the_page_open_sees_the_robot_move(vehicle, arc, headless, monkeypatch):
     received = []
     open_page = threading.Event()
@@ -284,6 +286,7 @@ def chosen(page, start, controller="HyRL", mode=live.SELECTED, noise="alternatin
     return page.track.arc
 
 
+@pytest.mark.slow
 def test_what_is_chosen_is_simulated_as_in_python(page):
     run = page.run
     for controller, name in live.CONTROLLERS.items():
@@ -299,6 +302,7 @@ def test_what_is_chosen_is_simulated_as_in_python(page):
     assert (page.track.arc.measured[0] != arc.measured[0]).any()
 
 
+@pytest.mark.slow
 def test_the_start_is_where_the_handle_has_been_dragged(page):
     chosen(page, 3.0)
     task = page.run.task

@@ -63,6 +63,7 @@ def test_two_runs_differ_at_the_posts_that_they_pass_on_different_sides(posts):
     np.testing.assert_array_equal(wind, windings(passing[second], passing[first]) * -1)
 
 
+@pytest.mark.slow
 def test_it_is_as_often_as_crossings_say_for_any_paths():
     rng, n = np.random.default_rng(0), 100
     a, b = rng.normal(size=(2, 12, n, 2))  # long steps, and any ends
@@ -78,6 +79,7 @@ def test_it_is_as_often_as_crossings_say_for_any_paths():
     assert np.abs(around % (2 * np.pi)).max() > 1, "the ends lie apart, and do not matter"
 
 
+@pytest.mark.slow
 def test_no_threshold_decides():
     field = Field(POST)
     hair = 1e-7  # [m] beside the middle of the post

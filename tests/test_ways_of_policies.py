@@ -31,6 +31,7 @@ def ahead(task, low=0.0, high=0.0, until=9.0):
     return ChartPolicy(task, rule)
 
 
+@pytest.mark.slow
 @pytest.mark.first(1)
 @pytest.mark.parametrize(("low", "high"), [(-0.15, 0.15), (-0.05, 0.33), (-0.31, 0.08), (0.0, 0.0)])
 def test_m_star_is_in_the_middle_of_a_wedge_of_failures(low, high):
@@ -42,6 +43,7 @@ def test_m_star_is_in_the_middle_of_a_wedge_of_failures(low, high):
     assert np.diff(np.sort(x)).max() <= 1.01 * found.spacing, "a gap"
 
 
+@pytest.mark.slow
 @pytest.mark.first(1)
 @pytest.mark.parametrize(("width", "noise"), [(0.42, EPS), (0.22, 0.05), (0.1, 0.0)])
 def test_across_a_wider_wedge_there_is_none(width, noise):
@@ -50,6 +52,7 @@ def test_across_a_wider_wedge_there_is_none(width, noise):
     assert not len(find_critical_set(field, policy, 40, 1 / 32, "outcome", noise).points)
 
 
+@pytest.mark.slow
 def test_where_no_measurement_helps_any_more_nothing_is_critical():
     """In front of the post both ways are closed from x = 2 - 0.5 sqrt(2) on, whatever is measured."""
     field = Field(WIDE)
@@ -59,6 +62,7 @@ def test_where_no_measurement_helps_any_more_nothing_is_critical():
     assert closed - 0.2 < before.max() < closed
 
 
+@pytest.mark.slow
 def test_ways_without_a_critical_set_between_them_are_said():
     field = Field(ROW)
     policy = ahead(field, -0.3, 0.3)
@@ -74,6 +78,7 @@ def test_ways_without_a_critical_set_between_them_are_said():
     )
 
 
+@pytest.mark.slow
 def test_failed_nodes_take_the_way_of_the_nearest_that_arrives():
     field, low, high = Field(WIDE), -0.05, 0.25
     policy = ahead(field, low, high)
@@ -90,6 +95,7 @@ def test_failed_nodes_take_the_way_of_the_nearest_that_arrives():
         np.testing.assert_array_equal(part.mask[wedge][sure], side * off[sure] > 0)
 
 
+@pytest.mark.slow
 @pytest.mark.first(1)
 @pytest.mark.parametrize("eps", [0.0, 0.1])
 def test_a_part_is_wide_enough_beside_m_star_for_the_set_of_the_other_mode_to_end_there(eps):
@@ -116,6 +122,7 @@ def test_a_part_is_wide_enough_beside_m_star_for_the_set_of_the_other_mode_to_en
         assert off < 0.2, "without noise nothing needs to be wide"
 
 
+@pytest.mark.slow
 def test_a_policy_of_which_nothing_arrives_is_split_all_the_same():
     field = Field(WIDE)
     policy = ahead(field, until=3.8)
@@ -132,6 +139,7 @@ def test_a_policy_of_which_nothing_arrives_is_split_all_the_same():
         np.testing.assert_array_equal(part.mask[start], side * nodes[start, 1] > 0)
 
 
+@pytest.mark.slow
 def test_where_nothing_is_left_to_decide_states_belong_to_every_part():
     field = Field({"_a": (1, 0, 0.3), "_b": (2.5, 0.6, 0.3)})
 
@@ -236,6 +244,7 @@ def test_a_mistake_is_one_sentence(mistake):
     assert len(text) < 400
 
 
+@pytest.mark.slow
 def test_what_is_right_is_taken():
     for task in (Field(WIDE), Field(ROW), looking(lambda m: m + 0)):
         assert check_task(task) is task
