@@ -14,7 +14,7 @@ from PIL import Image
 from hyrl_mj.errors import NoRenderer
 from hyrl_mj.files.artifacts import digest
 from hyrl_mj.files.manifest import FILES, Entry, Manifest
-from hyrl_mj.gym_import import draws, inspection, starts, trials
+from hyrl_mj.gym_import import draws, inspection, resets, starts, trials
 from hyrl_mj.gym_import.task import EnvironmentTask
 from hyrl_mj.judging import episodes, examination, results, worst_case
 from hyrl_mj.judging.game import Maps
@@ -148,7 +148,7 @@ def few_trials(patch):
     """
     few = {"EPISODES": 4, "SAMPLES": 16, "PLACES": 8, "RESETS": 24}
     few |= {"RUNS": 8, "LENGTH": 40, "FAR": 2}
-    for module in (inspection, trials, draws, starts):
+    for module in (inspection, trials, draws, starts, resets):
         for name in few.keys() & vars(module).keys():
             patch.setattr(module, name, few[name])
 

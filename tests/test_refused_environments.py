@@ -970,6 +970,7 @@ def test_what_cannot_be_written_down_is_compared_as_an_object():
     assert before == fingers(env)
     env.rows = (number for number in range(3))
     assert before != fingers(env)
+    assert Unknown() != Unknown()
     env.rows = type("Lock", (threading.local,), {})()
     assert not is_known(fingers(env))
 

@@ -11,7 +11,7 @@ anything rests on it. What could mislead is looked for in one place each:
   are told the place past the noise;
 - `starts`: whether a start elsewhere on the chart is as one that a reset would lead to.
 
-They share numbers in `attributes`, and the `fingerprint` of all that is remembered.
+They share what 64 `resets` lead to, numbers in `attributes`, and the `fingerprint` of all that is remembered.
 """
 
 from hyrl_mj.gym_import.making import (

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -13,10 +12,11 @@ from hyrl_mj.gym_import.coordinates import own_of
 from hyrl_mj.gym_import.fingerprint import Fingerprint, differing
 from hyrl_mj.gym_import.instance import Instance
 from hyrl_mj.gym_import.physics import PINNED
+from hyrl_mj.gym_import.resets import Resets
 from hyrl_mj.gym_import.trials import EPISODES, HELD, SAMPLES
 
-# Resets that are looked at, and of them those whose runs are compared beside those that change something.
-RESETS, COMPARED = 64, 4
+# Resets whose runs are compared, beside those that change something.
+COMPARED = 4
 # What is drawn where nothing tells it.
 UNKNOWN = (
     "something that no attribute holds (or it depends on the clock, on threads, or on chance that no seed "
@@ -25,46 +25,6 @@ UNKNOWN = (
 # Of what resets draw of the robot: how much of what runs reach is wide, and by how much of it the ends of
 # runs may differ.
 WIDE, APART = 1 / 3, 0.15
-
-
-@dataclass(frozen=True)
-class Resets:
-    """What the resets with the seeds 0 to 63 lead to.
-
-    Attributes:
-        states: MuJoCo's states (64, S).
-        changes: the names of what each of them leaves otherwise than the first, but for generators.
-        violation: by how much they violate equality constraints and limits of tendons at most [m, rad].
-    """
-
-    states: np.ndarray
-    changes: list[set[str]]
-    violation: float
-
-
-def resets_of(instance: Instance) -> Resets:
-    """Returns what resets lead to."""
-    states, changes, violation, first = [], [], 0.0, None
-    for seed in range(RESETS):
-        instance.reset(seed)
-        states.append(instance.physics.read())
-        violation = max(violation, violation_of(instance))
-        memory = instance.memory()
-        first = first or memory
-        names = {name for name in differing(first, memory) if "_seed" not in name}
-        changes.append(names - memory.generators.keys())
-    return Resets(np.array(states), changes, violation)
-
-
-def violation_of(instance: Instance, joints: bool = False) -> float:
-    """Returns by how much equality constraints and limits of tendons are violated at most [m, rad].
-
-    With `joints`, those of joints, too.
-    """
-    kinds, off, kind = instance.data.efc_type, instance.data.efc_pos, mujoco.mjtConstraint
-    limits = [kind.mjCNSTR_LIMIT_TENDON] + [kind.mjCNSTR_LIMIT_JOINT] * joints
-    equal, beyond = np.abs(off[kinds == kind.mjCNSTR_EQUALITY]), -off[np.isin(kinds, limits)]
-    return float(np.append(equal, beyond).max(initial=0.0))
 
 
 def check_draws(instance: Instance, resets: Resets, met: np.ndarray) -> str:

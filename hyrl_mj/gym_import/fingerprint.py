@@ -77,10 +77,14 @@ class Unknown:
     """A value that cannot be written down: all that is known is whether it is the same object.
 
     Attributes:
-        number: of the object in this process; of what lies too deep, that of the fingerprint itself.
+        number: of the object in this process, None of one that equals no other.
     """
 
-    number: int
+    number: int | None = None
+
+    def __eq__(self, other: object) -> bool:
+        known = isinstance(other, Unknown) and self.number is not None
+        return known and self.number == getattr(other, "number", None)
 
 
 def fingerprint(env: gym.Env, physics: Physics) -> Fingerprint:
@@ -191,7 +195,7 @@ def _walk(value: Any, path: str, found: Fingerprint, seen: set[int], depth: int)
     elif has_no_memory(value):
         return
     elif depth > DEEPEST or len(found) > MOST:
-        found[path] = Unknown(id(found))
+        found[path] = Unknown()
     else:
         seen.add(id(value))
         parts = _parts(value, path, found, depth)

@@ -23,7 +23,7 @@ from hyrl_mj.gym_import.coordinates import (
     own_of,
     robot_of,
 )
-from hyrl_mj.gym_import.draws import check_draws, resets_of, violation_of
+from hyrl_mj.gym_import.draws import check_draws
 from hyrl_mj.gym_import.expressions import Expression
 from hyrl_mj.gym_import.fingerprint import codes_of, differing, is_known
 from hyrl_mj.gym_import.instance import Instance, outlasting
@@ -38,6 +38,7 @@ from hyrl_mj.gym_import.opening import (
     made,
 )
 from hyrl_mj.gym_import.pool import Pool
+from hyrl_mj.gym_import.resets import SAME, resets_of, violation_of
 from hyrl_mj.gym_import.specification import Criterion
 from hyrl_mj.gym_import.starts import VIOLATED, check_noted
 from hyrl_mj.physics import memory, mjcf
@@ -101,8 +102,8 @@ def inspect(description: Description, untried: bool = False) -> tuple[Pool, Inst
     pool.learn(instance.spec)
     trials.check_runs(pool)
     trials.check_use(instance.spec)
+    trials.check_copied(instance.spec)
     instance.learn(led=check_noted(instance.spec, resets))
-    trials.check_place(instance.spec)
     pool.learn(instance.spec)
     moves, at_rest = trials.moving(pool)
     memoryless = pool.spec.memoryless and trials.goes_on(pool)
@@ -158,7 +159,7 @@ def _check_pinned(instance: Instance) -> None:
         )
     unit = instance.data.qpos.copy()
     mujoco.mj_normalizeQuat(instance.model, unit)
-    wrong = np.flatnonzero(np.abs(unit - instance.data.qpos) > trials.SAME)
+    wrong = np.flatnonzero(np.abs(unit - instance.data.qpos) > SAME)
     if any(f"qpos[{i}]" in names for i in wrong):
         raise BadInput(
             f"{told} is a part of a quaternion, whose squares do not sum to 1 with it: pin all of its four "

@@ -275,7 +275,6 @@ class Instance:
             What of it is not like a new one, so that it can play no other; "" if all is.
         """
         self.quit()
-        self.script, self.is_told = iter(()), False
         self.reset()
         return self.mark()
 

@@ -238,6 +238,10 @@ class EnvironmentPlant:
         """
         self._leave(self._rows(ids))
 
+    def put(self, state: np.ndarray) -> None:
+        """Refuses: runs are played from their starts."""
+        raise BadInput(f"no state can be written to a run of the environment {self.spec.name}")
+
     def step_backward(self, u: np.ndarray, ids: np.ndarray | None = None) -> None:
         """Refuses: an environment cannot be run backward."""
         raise BadInput(f"the environment {self.spec.name} cannot be run backward")

@@ -69,11 +69,14 @@ class Stage:
     def __init__(self, spec: EnvironmentSpec):
         self.spec = spec
         self._playing: dict[int, Instance] = {}  # by the number of the run
-        self._free: list[Instance] = []  # of those that have left their run
+        self._free: list[Instance] = []
         # Which play nothing but what they judge, as their user has them, or without time limits.
         self._judges: dict[bool, list[Instance]] = {True: [], False: []}
         self._lived: dict[bool, Instance] = {}  # which is never replaced
         self._wears = False  # whether something has outlasted a reset
+        self._elsewhere: list[Instance] = []
+        self._led: list[Instance] = []
+        self._resting: Instance | None = None
         self._fresh: Instance | None = None  # which has only been reset
 
     def try_out(self) -> Arrays:
@@ -128,14 +131,13 @@ class Stage:
     def rest(self, starts: np.ndarray) -> Arrays:
         """Returns what episodes that begin in states (k, S) observe first (k, o), and depths (k,) [m]."""
         seen, depths = [], []
-        for i, start in enumerate(starts):
-            if i == 0 or self.spec.wrapped:
-                instance = self._renewed(self._free)
-                self._free.append(instance)
-            instance.begin(start)
-            instance.sense()
-            seen.append(instance.observation)
-            depths.append(instance.physics.depth(self.spec.solid))
+        for start in starts:
+            if self._resting is None or self.spec.wrapped:
+                self._resting = self._renewed([self._resting] if self._resting else [])
+            self._resting.begin(start)
+            self._resting.sense()
+            seen.append(self._resting.observation)
+            depths.append(self._resting.physics.depth(self.spec.solid))
         return np.array(seen), np.array(depths)
 
     def branch(self, states: np.ndarray, u: np.ndarray) -> Arrays:
@@ -195,7 +197,7 @@ class Stage:
 
         They get what they got in a run, but in an environment whose robot is elsewhere, and goes elsewhere.
         """
-        other, chart = self._renewed(self._free), self.spec.chart
+        other, chart = self._renewed(self._elsewhere), self.spec.chart
         actions = copy.deepcopy(other.inner.action_space)
         actions.seed(seed)
         other.script = iter([one._replace(action=actions.sample()) for one in passed])
@@ -205,7 +207,7 @@ class Stage:
         with suppress(BadInput):  # it may not be able to go on from there
             for sample in other.play(start, run.inputs, np.zeros_like(run.noise)):
                 told.append(sample.observation)
-        self._free.append(other)
+        self._elsewhere.append(other)
         for k, (seen, shown) in enumerate(zip(run.observations, told, strict=False)):
             if (off := unlike(seen, shown)).any():
                 raise BadInput(
@@ -228,7 +230,7 @@ class Stage:
 
     def _lead(self, run: Played) -> None:
         """Plays a run from a reset that is led to its start, as its user would have it lead there."""
-        (usual, led), how = (self._renewed(self._free) for _ in range(2)), self.spec.led
+        (usual, led), how = (self._renewed(self._led) for _ in range(2)), self.spec.led
         if noted := how.noted(usual, led, run.start):
             led = self._renewed([led])
             with how.to(led, run.start):
@@ -238,7 +240,7 @@ class Stage:
                     judge(replace(run, rewards=None), led, run.noise, None)
                 except BadInput as error:
                     raise how.refused(led.name, noted) from error
-        self._free += [usual, led]
+        self._led += [usual, led]
 
     def _acted(
         self, instances: Sequence[Instance], u: np.ndarray, begun: np.ndarray | None = None

@@ -29,11 +29,11 @@ from hyrl_mj.gym_import.attributes import (
     value_at,
 )
 from hyrl_mj.gym_import.coordinates import own_of
-from hyrl_mj.gym_import.draws import Resets, violation_of
 from hyrl_mj.gym_import.fingerprint import LIBRARIES, differing, shared_variables
 from hyrl_mj.gym_import.instance import Instance, Seen, renewed, to_end
+from hyrl_mj.gym_import.resets import SAME, Resets, violation_of
 from hyrl_mj.gym_import.specification import EnvironmentSpec
-from hyrl_mj.gym_import.trials import EPISODES, HELD, SAME, SAMPLES
+from hyrl_mj.gym_import.trials import EPISODES, HELD, SAMPLES
 
 # How much farther than a reset notes it, as a share of that, something is moved.
 FAR = 3
@@ -55,11 +55,29 @@ def check_noted(spec: EnvironmentSpec, resets: Resets) -> Led | None:
         How these are; None if resets note nothing.
     """
     _check_ties(spec, resets)
-    return _check_led(spec)
+    led = _check_led(spec)
+    _check_begun(spec)
+    return led
 
 
 def _starts(spec: EnvironmentSpec, rng: np.random.Generator) -> np.ndarray:
     return spec.state_at(spec.anywhere(rng, EPISODES))
+
+
+def _check_begun(spec: EnvironmentSpec) -> None:
+    """Raises `BadInput` if a first sample leads to one place, wherever on the chart a run begins."""
+    rng, instance, ends = np.random.default_rng(11), Instance(spec), list[np.ndarray]()
+    starts, inputs, none = _starts(spec, rng), [instance.drawn(rng)], np.zeros((2, spec.dimension))
+    for state in starts:
+        instance = renewed(instance)
+        *_, last = instance.play(state, inputs, none)
+        ends.append(last.state)
+    apart, stays = (np.ptp(spec.z(np.array(states)), axis=0) > 0 for states in (starts, ends))
+    for c in np.array(spec.coordinates, dtype=object)[apart & ~stays]:
+        raise BadInput(
+            f"step() of {spec.name} leads to one {c.name}, wherever on the chart a run begins: it goes by "
+            "something else than MuJoCo's state in its attribute data, as by a second one; let it step that"
+        )
 
 
 def _check_ties(spec: EnvironmentSpec, resets: Resets) -> None:
