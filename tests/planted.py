@@ -151,6 +151,7 @@ def few_trials(patch):
     for module in (inspection, trials, draws, starts, resets):
         for name in few.keys() & vars(module).keys():
             patch.setattr(module, name, few[name])
+    patch.setattr(trials._runs, "__defaults__", (few["EPISODES"],))
 
 
 def without_judges(patch):
@@ -158,7 +159,8 @@ def without_judges(patch):
 
     This takes a third of the time, and what the other trials find does not depend on it.
     """
-    patch.setattr(trials, "check_runs", lambda pool: None)
+    for name in ("check_episodes", "check_noise"):
+        patch.setattr(trials, name, lambda pool: None)
 
 
 def few_steps(patch):

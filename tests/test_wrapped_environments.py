@@ -175,7 +175,7 @@ def test_wrappers_that_observe_the_place_past_the_noise_are_refused(way, telling
     pool = Pool(Description(WAYS[way], steps=20))
     pool.learn(replace(telling_nothing, description=pool.spec.description))
     with pytest.raises(BadInput, match=TOLD):
-        trials.check_runs(pool)
+        trials.check_noise(pool)
 
 
 def test_wrappers_that_copy_the_environment_are_refused():

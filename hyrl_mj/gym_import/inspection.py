@@ -95,17 +95,18 @@ def inspect(description: Description, untried: bool = False) -> tuple[Pool, Inst
     instance.learn(state=_at_rest(instance, resets.states))
     _learn_bounds(instance, instance.spec.z(states), instance.spec.z(resets.states))
     instance.learn(recalled=trials.check_observer(instance.spec))
+    pool.learn(instance.spec)
+    trials.check_episodes(pool)
+    trials.check_use(instance.spec)
+    trials.check_copied(instance.spec)
     derived, late = trials.derived_of(instance)
     if late:
         instance.spec.found["lag"] = f"observation {', '.join(map(str, late))} {LAG[derived]}"
     instance.learn(derived=derived)
-    pool.learn(instance.spec)
-    trials.check_runs(pool)
-    trials.check_use(instance.spec)
-    trials.check_copied(instance.spec)
     instance.learn(led=check_noted(instance.spec, resets))
     pool.learn(instance.spec)
     moves, at_rest = trials.moving(pool)
+    trials.check_noise(pool)
     memoryless = pool.spec.memoryless and trials.goes_on(pool)
     pool.learn(replace(pool.spec, moves=moves, at_rest=at_rest, memoryless=memoryless))
     if lasts := outlasting(used):

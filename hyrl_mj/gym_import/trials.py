@@ -5,16 +5,16 @@ whether its instances go as new ones.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from itertools import chain, zip_longest
+from itertools import chain
 from typing import Any
 
 import numpy as np
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.gym_import.coordinates import own_of
-from hyrl_mj.gym_import.instance import Instance, Seen, begun, renewed, to_end
+from hyrl_mj.gym_import.instance import Instance, Seen, renewed, to_end
 from hyrl_mj.gym_import.observations import flat, observers, shaped, unlike
-from hyrl_mj.gym_import.plant import check_finite
+from hyrl_mj.gym_import.plant import EnvironmentPlant, check_finite
 from hyrl_mj.gym_import.pool import Pool
 from hyrl_mj.gym_import.resets import SAME
 from hyrl_mj.gym_import.specification import MOVED, Derived, EnvironmentSpec
@@ -281,50 +281,38 @@ def check_copied(spec: EnvironmentSpec) -> None:
 
 
 def _runs(
-    pool: Pool, seed: int, n: int, share: float = 0.0
-) -> Iterator[tuple[np.ndarray, np.ndarray, list[Seen]]]:
-    """Yields inputs (k, m), noise (k + 1, d) and what is seen (k + 1) of n runs at most, side by side.
+    pool: Pool, seed: int, n: int = EPISODES
+) -> Iterator[tuple[EnvironmentPlant, np.ndarray]]:
+    """Yields n runs from starts at random, before each sample, with inputs (n, m) at random for it.
 
-    Starts, inputs and noise are drawn, the latter within a share of the sides of the chart. Some starts are
-    drawn more, for those that are not free of walls.
+    Some starts are drawn more, and of these the ones that are free of walls come first.
     """
-    spec, rng = pool.spec, np.random.default_rng(seed)
-    samples, bound = min(SAMPLES, spec.max_steps), share * spec.chart.sides * spec.noisy
+    rng, spec = np.random.default_rng(seed), pool.spec
     states = spec.state_at(spec.anywhere(rng, 3 * n))
     _, depths = pool.scatter("rest", states)
-    instances, inputs, noises, plays = list[Instance](), [], [], []
-    for state in states[depths <= spec.depth][:n]:
-        instances.append(begun(Instance(spec), None))
-        drawn = [instances[-1].drawn(rng) for _ in range(0, samples, HELD)]
-        inputs.append(np.repeat(drawn, HELD, axis=0)[:samples])
-        noises.append(rng.uniform(-bound, bound, (samples + 1, spec.dimension)))
-        plays.append(to_end(instances[-1].play(state, inputs[-1], noises[-1])))
-    if not instances:
-        return
-    with instances[0].undrawn():
-        seen = [*zip_longest(*plays)]
-    for instance in instances:
-        instance.finish()
-    for u, noise, of_run in zip(inputs, noises, zip(*seen, strict=True), strict=True):
-        run = [one for one in of_run if one is not None]
-        _, outcome = spec.criterion.judged(np.array([one.report for one in run[1:]], dtype=float))
-        over = np.append(np.flatnonzero(outcome != Outcome.RUNNING), len(outcome) - 1)[0] + 1
-        yield u[:over], noise[: over + 1], run[: over + 1]
+    states = states[np.argsort(depths > spec.depth, kind="stable")[:n]]
+    plant = EnvironmentPlant(pool, None, n)
+    plant.set_state(states[:, spec.qpos], states[:, spec.qvel])
+    for k in range(min(SAMPLES, spec.max_steps)):
+        if k % HELD == 0:
+            u = rng.uniform(spec.low, spec.high, (n, len(spec.low)))
+        yield plant, u if spec.levels is None else np.round(u)
 
 
-def check_runs(pool: Pool) -> None:
-    """Raises `BadInput` unless instances go as new ones under noise, and later episodes as a first.
+def check_episodes(pool: Pool) -> None:
+    """Raises `BadInput` unless instances go as new ones after other episodes, and later episodes as a first.
 
     Some runs are judged in a process of their own each. More are judged one after the other in one, and by
     an environment that is never replaced: neither what outlasts its resets nor what these draw may matter.
     Not all of them may be a success at once.
     """
-    apart, in_turn = (_played(pool, seed, n) for seed, n in ((3, EPISODES), (4, 2 * EPISODES)))
-    pool.check(apart, processes=EPISODES)
-    pool.check(in_turn, processes=1)
-    runs = [*apart, *in_turn]
-    if runs and all(
-        len(run.inputs) == 1 and run.outcome == Outcome.REACHED and not run.cut for run in runs
+    runs = _episodes(pool, 3, EPISODES)
+    pool.check(runs, processes=EPISODES)
+    more = _episodes(pool, 4, 2 * EPISODES)
+    pool.check(more, processes=1)
+    begun = [run for run in (*runs, *more) if len(run.inputs)]
+    if begun and all(
+        len(run.inputs) == 1 and run.outcome == Outcome.REACHED and not run.cut for run in begun
     ):
         raise BadInput(
             f"each run of {pool.spec.name} is a success after its first step, wherever it begins and "
@@ -333,27 +321,57 @@ def check_runs(pool: Pool) -> None:
         )
 
 
-def _played(pool: Pool, seed: int, n: int) -> list[Played]:
-    """Returns n runs at most from starts at random, under noise."""
-    spec, found = pool.spec, []
-    for inputs, noise, run in _runs(pool, seed, n, MOVED):
-        states, observations, reports = zip(*run, strict=True)
-        told, cut = np.array(reports[1:], dtype=float), len(inputs) == spec.max_steps
-        success, outcome = spec.criterion.judged(told)
-        if cut and outcome[-1] == Outcome.RUNNING:
-            outcome = spec.criterion.verdict(success)
-        found.append(
-            Played(
-                states[0],
-                inputs,
-                spec.z(np.array(states)),
-                int(outcome[-1]),
-                cut,
-                np.array(observations),
-                noise,
-                told[:, :1],
-            )
+def check_noise(pool: Pool) -> None:
+    """Raises `BadInput` unless instances go as new ones under noise."""
+    pool.check([run for seed in (5, 6) for run in _episodes(pool, seed, EPISODES, MOVED)])
+
+
+def _episodes(pool: Pool, seed: int, n: int, share: float = 0.0) -> list[Played]:
+    """Returns n runs from starts at random, under noise of a share of the sides of the chart."""
+    spec, everyone = pool.spec, np.arange(n)
+    d, o = spec.dimension, spec.columns
+    rng, bound = np.random.default_rng(seed), share * spec.chart.sides * spec.noisy
+    starts, inputs, noises, told = [], [], [], []
+    for plant, u in _runs(pool, seed, n):
+        starts.append(plant.state)
+        noises.append(rng.uniform(-bound, bound, (n, d)))
+        told.append(_observed(plant, noises[-1]))
+        plant.step(u)
+        inputs.append(u)
+    noises.append(np.zeros((n, d)))
+    told.append(_observed(plant, noises[-1]))
+    plant.end()
+    u, path, noise = np.array(inputs), np.array(told), np.array(noises)
+    over = path[:, :, -1] != 0
+    ends = np.where(over.any(axis=0), over.argmax(axis=0), len(u))
+    last, cut = path[ends, everyone], ends == spec.max_steps
+    outcome = np.where(
+        cut & (last[:, -1] == 0), spec.criterion.verdict(last[:, -2] > 0), last[:, -1]
+    )
+    if not spec.wrapped:  # at an end that is known nothing is observed any more
+        noise[ends, everyone] = 0.0
+    return [
+        Played(
+            starts[0][i],
+            u[:end, i],
+            path[: end + 1, i, :d],
+            int(outcome[i]),
+            bool(cut[i]),
+            path[: end + 1, i, d : d + o],
+            noise[: end + 1, i],
+            path[1 : end + 1, i, d + o : d + o + 1],
         )
+        for i, end in enumerate(ends)
+    ]
+
+
+def _observed(plant: EnvironmentPlant, noise: np.ndarray) -> np.ndarray:
+    """Returns the measurements (n, p) of runs with the observation under noise (n, d)."""
+    d, o, everyone = plant.spec.dimension, plant.spec.columns, np.arange(plant.n)
+    errors = np.pad(noise, ((0, 0), (0, o + 3)))
+    seen = plant.observe(plant.truth(everyone), errors, everyone)[:, d : d + o]
+    found = plant.truth(everyone)
+    found[:, d : d + o] = seen
     return found
 
 
@@ -366,26 +384,26 @@ def goes_on(pool: Pool, of_chart: bool = False) -> bool:
             all there is; by default MuJoCo's states of the runs.
     """
     spec, rng = pool.spec, np.random.default_rng(4)
-    before, inputs, seen = [], [], list[Seen]()
-    for u, _, run in _runs(pool, 4, 48 if of_chart else EPISODES):
-        before += [one.state for one in run[:-1]]
-        inputs += [*u]
-        seen += run[1:]
-    if not seen:
-        return True
-    written = np.array(before)
-    if of_chart:
-        written = spec.state_at(spec.z(written))
-        # The time, which comes first in a state, is no part of the chart, and may matter late.
-        written[:, 0] = rng.uniform(0, spec.max_steps * spec.dt, len(written))
-    try:
-        theirs = pool.scatter("branch", written, np.array(inputs))
-    except BadInput:
-        return False
-    ours = [np.array(part, dtype=float) for part in zip(*seen, strict=True)]
-    told, expected = (
-        np.column_stack([spec.z(states), observed, reports[:, 0], *spec.criterion.judged(reports)])
-        for states, observed, reports in (theirs, ours)
-    )
-    exact = of_chart or all(map(np.array_equal, ours[:2], theirs[:2]))
-    return exact and np.allclose(told, expected, rtol=0, atol=1e-9, equal_nan=True)
+    for plant, u in _runs(pool, 4, 48 if of_chart else EPISODES):
+        going = np.flatnonzero(plant.measurement[:, -1] == 0)
+        before = plant.state[going]
+        plant.step(u[going], going)
+        if not len(going):
+            return True
+        written = before
+        if of_chart:
+            written = spec.state_at(spec.z(before))
+            # The time, which comes first in a state, is no part of the chart, and may matter late.
+            written[:, 0] = rng.uniform(0, spec.max_steps * spec.dt, len(going))
+        try:
+            after, seen, report = pool.scatter("branch", written, u[going])
+        except BadInput:
+            return False
+        success, outcome = spec.criterion.judged(report)
+        told = np.column_stack([spec.z(after), seen, report[:, 0], success, outcome])
+        if not np.allclose(told, plant.measurement[going], rtol=0, atol=1e-9, equal_nan=True):
+            return False
+        exact = np.array_equal(seen, plant.measurement[going, spec.dimension : -3])
+        if not of_chart and not (exact and np.array_equal(after, plant.state[going])):
+            return False
+    return True
