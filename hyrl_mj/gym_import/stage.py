@@ -78,12 +78,13 @@ class Stage:
         self._led: list[Instance] = []
         self._resting: Instance | None = None
         self._fresh: Instance | None = None  # which has only been reset
+        self._shared: written.Fingerprint | None = None  # by a new instance with all others
 
     def try_out(self) -> Arrays:
         """Makes, resets and steps an environment within limits of time and memory of this process."""
         limits.limit()
         with trust.received():  # code that an argument names does not run
-            instance = Instance(self.spec)
+            instance = self._new(real=False)
             instance.reset()
             instance.stepped(instance.drawn(np.random.default_rng(0)))
         return ()
@@ -163,7 +164,7 @@ class Stage:
     def check(self, runs: Sequence[Played]) -> None:
         """Plays runs in new environments; raises `BadInput` if these go another way."""
         if self._fresh is None:
-            self._fresh = Instance(self.spec)
+            self._fresh = self._new(real=False)
             self._fresh.reset()
         for i, run in enumerate(runs):
             # A time limit of its own would end a run that is simulated for longer.
@@ -264,10 +265,20 @@ class Stage:
         old = None
         while spare:
             old = spare.pop()
-            if not old.renew():
+            if not (worn := old.renew()):
                 return old
             self._wears = True
-        return begun(Instance(self.spec, real), old)
+            if written.is_shared(worn):
+                raise old.sharing(worn)
+        return begun(self._new(real), old)
+
+    def _new(self, real: bool) -> Instance:
+        instance = Instance(self.spec, real)
+        shared = written.shared(instance.env)
+        self._shared = self._shared or shared
+        if changed := written.differing(shared, self._shared):
+            raise instance.sharing(changed[0])
+        return instance
 
 
 def judge(run: Played, real: Instance, noise: np.ndarray, fresh: Instance | None) -> None:
