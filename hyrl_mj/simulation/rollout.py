@@ -143,19 +143,15 @@ def closed_loop(
     k, length, first_mode = np.zeros(n, dtype=int), np.zeros(n, dtype=int), q.copy()
     p, m, every = len(task.noisy), len(task.inputs), np.arange(n)
     shapes = {"before": (), "q": (), "measured": (p,), "u": (m,), "noise": (p,)}
-    samples = int(limit.max(initial=0))
-    # Of runs that are over while others go on, they are NaN.
-    kept = {
-        name: np.full((samples + 1, n, *shape), np.nan) for name, shape in shapes.items() if record
-    }
+    kept = {name: _Table(n, shape) for name, shape in shapes.items() if record}
     firsts = {"path": task.chart.near(task.z(measurement), z0)}
     if record:
         firsts |= {"true": measurement} | ({"state": plant.state} if settings.states else {})
     for name, values in firsts.items():
-        kept[name] = np.full((samples + 1, *values.shape), np.nan)
-        kept[name][0] = values
+        kept[name] = _Table(n, values.shape[1:])
+        kept[name].put(k, every, values)
     passing = Passing.begin(task, plant) if settings.passing else None
-    ticks = range(samples) if together else count()
+    ticks = range(int(limit.max(initial=0))) if together else count()
     for tick in progress_bar(ticks, settings.label, "samples", quiet=settings.quiet):
         active = np.flatnonzero((outcome == Outcome.RUNNING) & (k < limit))[:most]
         if not len(active):
@@ -183,9 +179,9 @@ def closed_loop(
         lost = plant.unstable
         stable = rows[~lost[rows]]  # the others keep the last one before they became unstable
         measurement[stable] = plant.truth(stable)
-        path = task.chart.near(task.z(measurement[rows]), kept["path"][now.k, rows])
+        path = task.chart.near(task.z(measurement[rows]), kept["path"].values[now.k, rows])
         k[rows] += 1
-        kept["path"][k[rows], rows] = path
+        kept["path"].put(k[rows], rows, path)
         length[active] = k[active]
         if passing is not None:
             passing.follow(task, plant, active[~lost[active]])
@@ -201,22 +197,22 @@ def closed_loop(
             plant.end(over)
         if record:
             for name, values in zip(shapes, (before, q[rows], measured, u, errors), strict=True):
-                kept[name][now.k, rows] = values
-            kept["true"][k[rows], rows] = measurement[rows]
+                kept[name].put(now.k, rows, values)
+            kept["true"].put(k[rows], rows, measurement[rows])
         if "state" in kept:
-            was, state = kept["state"][now.k, rows], plant.state[rows]
-            kept["state"][k[rows], rows] = np.where(lost[rows, None], was, state)
+            was, state = kept["state"].values[now.k, rows], plant.state[rows]
+            kept["state"].put(k[rows], rows, np.where(lost[rows, None], was, state))
     ask.again()
     plant.end()
     if not together:
         for name, table in kept.items():
             if name not in ("u", "noise"):
-                _stay(table, length - (name in shapes))
-    longest = length.max(initial=0)
+                _stay(table.values, length - (name in shapes))
+    samples = length.max(initial=0)
     arrays = {name: np.empty((0, n, *shape)) for name, shape in shapes.items()}
     arrays |= {"true": np.empty(0), "state": np.empty(0)}
     for name, table in kept.items():
-        arrays[name] = table[: longest + (name not in shapes or name == "noise")]
+        arrays[name] = table.values[: samples + (name not in shapes or name == "noise")]
     for name in ("before", "q"):  # of runs that were over before they began, none
         arrays[name] = np.nan_to_num(arrays[name], nan=NOT_STARTED).astype(int)
     return Rollout(
@@ -247,6 +243,23 @@ def _noise(
     noise = np.zeros_like(now.measurement)
     noise[:, columns] = [ahead[k][row] for k, row in zip(now.k, now.rows, strict=True)]
     return noise
+
+
+class _Table:
+    """Values (K, n, ...) of n runs, which may be at different samples; NaN where there are none.
+
+    There is room for 64 samples at first; then it doubles.
+    """
+
+    def __init__(self, n: int, shape: tuple[int, ...]):
+        self.values = np.full((64, n, *shape), np.nan)
+
+    def put(self, k: np.ndarray, rows: np.ndarray, values: np.ndarray) -> None:
+        """Takes values (r, ...) of the samples k (r,) of the runs `rows` (r,)."""
+        if (more := int(k.max(initial=0)) + 1 - len(self.values)) > 0:
+            shape = max(more, len(self.values)), *self.values.shape[1:]
+            self.values = np.concatenate([self.values, np.full(shape, np.nan)])
+        self.values[k, rows] = values
 
 
 def _stay(values: np.ndarray, last: np.ndarray) -> None:
