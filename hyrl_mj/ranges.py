@@ -125,9 +125,8 @@ class Several:
 
     def checked(self, name: str, value: Any) -> tuple[Any, ...]:
         if not isinstance(value, list | tuple) or not self.fewest <= len(value) <= self.most:
-            exactly = self.fewest == self.most
-            count = self.fewest if exactly else f"{self.fewest} to {self.most}"
-            raise refused(name, value, f"a tuple of {count} values")
+            count = f"{self.fewest} to {self.most}" if self.fewest < self.most else f"{self.most}"
+            raise refused(name, value, f"a tuple of {count} value{'s' if self.most > 1 else ''}")
         return tuple(self.rule.checked(f"{name}[{i}]", part) for i, part in enumerate(value))
 
 

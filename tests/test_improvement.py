@@ -37,6 +37,9 @@ def test_means_differences_and_the_probability_of_improvement():
 @pytest.mark.parametrize("figure", ["proved", "not_broken", "margin"])
 def test_a_run_that_has_no_figure_of_one_controller_is_not_left_out(figure):
     rows = [row(CIRCLE, 0, 0.1, 0.3, figure), row(CIRCLE, 1, 0.1, None, figure)]
+    if figure == "proved":  # that it could not be bounded is no loss
+        assert improvements(rows)[0].runs == 1
+        rows[1].figures["hyrl_not_broken"] = None  # a replay refuted the game
     (found,) = improvements(rows)
     assert (found.runs, found.policy.value, found.hyrl.value) == (2, 0.1, 0.15)
     shares = profile(rows, figure, np.array([0.05, 0.2]))

@@ -94,10 +94,11 @@ def _check(path: str | Path, header: Sequence[str]) -> None:
     """Raises `BadInput` unless the first line of a file names its columns."""
     if not any(header):
         raise BadInput(f"{path} is empty or begins with an empty line: {NEEDED}")
-    if len(header) > 10_000 or max(map(len, header)) > 200:
+    names, longest = 10_000, 200  # no log of a robot has more, and messages quote them
+    if len(header) > names or max(map(len, header)) > longest:
         raise BadInput(
             f"{path} has {len(header):,} names of up to {max(map(len, header)):,} characters: give at most "
-            "10,000 of at most 200"
+            f"{names:,} of at most {longest}"
         )
     if len(header) == 1 and (other := [sign for sign in "\t;|" if sign in header[0]]):
         raise BadInput(

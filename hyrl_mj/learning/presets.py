@@ -173,11 +173,11 @@ def preset(
     if task.kinematic and dimension == 2:
         cells = aligned_cells(task, cells)
     if not task.kinematic and dimension == 3 and name != "smoke":
-        # As many more as the noise needs; most of their nodes are not simulated.
+        # As many more as the noise needs, up to 88 (680,000 nodes); most of them are not simulated.
         cells = enough_cells(task.chart, task.noise_in_chart(eps), cells, most=88)
     if (most := task.learning.cells) is not None:
         rods, cells = min(rods, most), min(cells, most)
-        resolution = 1 / 8  # runs from many nodes take too long
+        resolution = 1 / 8  # longer last rods: runs from many nodes take too long
     settings = Settings(
         task=reference(task),
         preset=name,

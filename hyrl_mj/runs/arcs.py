@@ -32,7 +32,7 @@ from hyrl_mj.tasks import Task
 
 
 def near_middle(task: Task, z: np.ndarray, most: int) -> np.ndarray:
-    """Returns so many of chart points (n, d): the nearest to the middle of the replay starts, these first."""
+    """Returns those chart points (n, d), `most` or fewer, nearest to the middle of the replay starts, in order."""
     off = task.chart.difference(z, np.mean(task.scene.starts, axis=0))
     return z[np.argsort(np.linalg.norm(off, axis=1), kind="stable")[:most]]
 

@@ -32,9 +32,6 @@ SAMPLED = {
     **{f"reached_{kind}": f"episodes_{kind}" for kind in KINDS},
     "withstood_attack": "attacked",
 }
-# Figures of the game. Where only one controller has one, a replay refuted what was proved of the other, or it
-# loses some start without noise: its figure counts as 0, because leaving the run out would favour it.
-OF_GAME = ("proved", "not_broken", "margin")
 # Seeds of each setting from which an interval is computed.
 LEAST_SEEDS = 3
 
@@ -53,7 +50,7 @@ class Improvement:
 
     Attributes:
         figure: its name in `COMPARED`.
-        runs: number of runs that have it, see also `OF_GAME`.
+        runs: number of runs that have it.
         policy, hyrl: the means of both controllers, over the seeds and then over the settings.
         difference: of HyRL less the policy, in the same runs.
         better: the probability that HyRL is better than the policy in a run of the same setting with
@@ -69,7 +66,7 @@ class Improvement:
 
 
 def improvements(rows: Iterable[Row]) -> list[Improvement]:
-    """Returns what HyRL improves, for each figure that both controllers have in all runs that are done."""
+    """Returns what HyRL improves, for each figure by which both controllers of a run can be compared."""
     done = [row for row in rows if row.done]
     found = []
     for figure, more in COMPARED.items():
@@ -148,8 +145,17 @@ def profile(rows: Iterable[Row], figure: str, thresholds: np.ndarray) -> dict[st
 
 
 def _of_both(row: Row, figure: str) -> tuple[float, float] | None:
-    """Returns a figure of policy and HyRL in a run; None if they cannot be compared by it."""
-    policy, hyrl = (row.figures.get(f"{who}_{figure}") for who in ("policy", "hyrl"))
-    if figure in OF_GAME and (policy is None) != (hyrl is None):
-        return policy or 0.0, hyrl or 0.0
+    """Returns a figure of policy and HyRL in a run; None if they cannot be compared by it.
+
+    Where one of them alone has none because it loses a start without noise, or because a replay refuted what
+    the game says of it, its figure is 0: to leave the run out would favour it. What was refuted has no share
+    that is not broken, and what could not be proved has one.
+    """
+    found = {who: row.figures.get(f"{who}_{figure}") for who in ("policy", "hyrl")}
+    lacking = [who for who, value in found.items() if value is None]
+    if len(lacking) == 1:
+        refuted = row.figures.get(f"{lacking[0]}_not_broken", 1.0) is None
+        if figure == "margin" or (refuted and figure in ("proved", "not_broken")):
+            found[lacking[0]] = 0.0
+    policy, hyrl = found.values()
     return None if policy is None or hyrl is None else (policy, hyrl)

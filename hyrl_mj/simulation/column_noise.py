@@ -265,10 +265,10 @@ def _correlated(
     ]
 
 
-def _autocorrelation(left: np.ndarray, used: np.ndarray, most: int = 40) -> np.ndarray:
-    """Returns the autocorrelation, for lags from 0 to `most`, of the values (n,) that are used (n,)."""
+def _autocorrelation(left: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Returns the autocorrelation, for lags from 0 to 40, of the values (n,) that are used (n,)."""
     white, n = np.where(used, left - left[used].mean(), 0.0), len(left)
-    lags = range(min(most + 1, n))
+    lags = range(min(41, n))
     sums = np.array([white[lag:] @ white[: n - lag] for lag in lags])
     counts = np.array([np.count_nonzero(used[lag:] & used[: n - lag]) for lag in lags])
     # Of a few pairs nothing can be told.

@@ -258,8 +258,8 @@ class Sensor:
                 f"the sensor {text!r:.60} is no text: give one as 'uniform 0.05 + delay 1'"
             )
         parts = re.split(r"\+(?!\d)", text)  # not that of 1e+3
-        if len(parts) > 20:  # each takes its time at every sample
-            raise BadInput(f"the sensor {text!r:.60} has {len(parts):,} parts: give at most 20")
+        if len(parts) > (most := 20):  # each takes its time at every sample
+            raise BadInput(f"the sensor {text!r:.60} has {len(parts):,} parts: give at most {most}")
         return Sensor(tuple(map(Part.parse, parts)))
 
     def __post_init__(self) -> None:

@@ -146,7 +146,7 @@ def jumped_over(task: Task) -> str:
     z = z[task.goes_on(z)]
     plant, u = task.placed(z, rng), task.draw_inputs(len(z), rng)
     with mujoco_log.kept(), suppress(BadInput):  # beside its chart a robot may be nowhere
-        for _ in range(10):  # samples
+        for _ in range(10):  # samples, in which most runs come past something
             before = plant.measurement
             plant.step(u)
             after = plant.measurement

@@ -67,8 +67,8 @@ def ends_well(task: Task) -> bool:
     Where they do may be small: it is looked for nearer and nearer to where the task's `miss` is least, too.
     """
     rng, chart = np.random.default_rng(0), task.chart
-    # Of so many states; then of some as near to the best of them, as shares of the chart, each time a half to
-    # a quarter as far. An end that is smaller than the last may be missed.
+    # It is looked for at this number of states, and then nearer and nearer to the best of them: within these
+    # shares of the chart, each a half to a quarter of the one before. A smaller end may be missed.
     states, nearer = 4_000, (0.05, 0.02, 0.005, 0.002, 0.0005)
     for beyond in (0.0, 0.1, 1.0, 10.0):
         by = np.where(chart.periodic, 0.0, beyond * chart.sides)

@@ -163,6 +163,7 @@ def try_elsewhere(task: Task) -> None:
         command = [sys.executable, "-P", "-c", program, str(task.source), answers]
         own = os.environ | {"PYTHONHASHSEED": seed, "PYTHONPATH": places}
         with suppress(subprocess.TimeoutExpired):
+            # [s]: to import a task takes seconds; one that takes a minute is left alone.
             subprocess.run(command, env=own, capture_output=True, timeout=60, check=False)
         if not os.path.exists(answers):
             return

@@ -7,6 +7,7 @@ from itertools import product
 
 import numpy as np
 
+from hyrl_mj.errors import BadInput
 from hyrl_mj.sets import MOST_NODES, Grid
 from hyrl_mj.tasks import Task
 
@@ -32,11 +33,16 @@ def lattice_grid(task: Task, cells: int = 0, most: int | None = None) -> Grid:
     as the distances that one sample moves the robot.
 
     Args:
-        task: the robot and its problem, on a chart of at most three dimensions (see `Lattice.why_not`).
+        task: the robot and its problem.
         cells: cells along the longest side, 0 for the usual number.
         most: if given, no more cells than this.
+
+    Raises:
+        BadInput: the chart has more than three dimensions.
     """
     chart, sides = task.chart, task.chart.sides
+    if chart.dimension not in LATTICE:
+        raise BadInput(f"no lattice has {chart.dimension} dimensions: give a chart of at most 3")
     cells = cells or LATTICE[chart.dimension]
     cells = cells if most is None else min(cells, most)
     hops = probed_hops(task)
