@@ -260,16 +260,17 @@ LONGEST += ("docs", "surroundings", "cli", "report", "training", "tables", "door
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Of the cases of a test that is marked `first(n)`, those after the n-th are `long`.
+    """Of the cases of a test that is marked `first(n)` or `fast(n)`, those after the n-th are `long` or `slow`.
 
     Files with slow tests come first, the longest before all: no process ends long after the other.
     """
     seen = Counter()
     for item in items:
-        if mark := item.get_closest_marker("first"):
-            seen[item.path, item.originalname] += 1
-            if seen[item.path, item.originalname] > mark.args[0]:
-                item.add_marker(pytest.mark.long)
+        for name, then in (("first", pytest.mark.long), ("fast", pytest.mark.slow)):
+            if mark := item.get_closest_marker(name):
+                seen[name, item.path, item.originalname] += 1
+                if seen[name, item.path, item.originalname] > mark.args[0]:
+                    item.add_marker(then)
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     places = {f"test_{name}": place for place, name in enumerate(LONGEST)}
 

@@ -353,7 +353,7 @@ MISTAKES = {
 }  # fmt: skip
 
 
-@pytest.mark.slow
+@pytest.mark.fast(3)
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_a_mistake_is_one_sentence_before_any_training(unknown_tasks, tmp_path, mistake):
     file, old, new, says = MISTAKES[mistake]

@@ -158,7 +158,7 @@ MISTAKES = {
 }  # fmt: skip
 
 
-@pytest.mark.slow
+@pytest.mark.fast(8)
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_a_mistake_is_one_sentence(tmp_path, monkeypatch, mistake, caplog):
     monkeypatch.chdir(tmp_path)

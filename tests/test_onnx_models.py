@@ -59,7 +59,7 @@ def function(name, *nodes, domain="mine"):
     return helper.make_function(domain, name, ["a"], ["r"], list(nodes), opsets)
 
 
-@pytest.mark.slow
+@pytest.mark.fast(1)
 @pytest.mark.parametrize(
     ("nodes", "constants", "operator"),
     [

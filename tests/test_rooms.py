@@ -112,7 +112,7 @@ except SystemExit:
 """
 
 
-@pytest.mark.slow
+@pytest.mark.fast(1)
 @pytest.mark.parametrize(
     ("code", "heavy"), [("import hyrl_mj", HEAVY | {"tyro"}), (HELP, HEAVY)], ids=["import", "help"]
 )
