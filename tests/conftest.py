@@ -260,7 +260,7 @@ LONGEST += ("docs", "surroundings", "cli", "report", "training", "tables", "door
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Of the cases of a test that is marked `first(n)` or `fast(n)`, those after the n-th are `long` or `slow`.
+    """Of the cases of a test marked `first(n)` or `fast(n)`, those after the n-th are `long` or `slow`.
 
     Files with slow tests come first, the longest before all: no process ends long after the other.
     """

@@ -32,7 +32,7 @@ from hyrl_mj.tasks import Task
 
 
 def near_middle(task: Task, z: np.ndarray, most: int) -> np.ndarray:
-    """Returns the `most` chart points (n, d) that are nearest to the middle of the replay starts, in order."""
+    """Returns `most` chart points (n, d) that are nearest to the middle of the replay starts, in order."""
     off = task.chart.difference(z, np.mean(task.scene.starts, axis=0))
     return z[np.argsort(np.linalg.norm(off, axis=1), kind="stable")[:most]]
 

@@ -337,7 +337,7 @@ def neighbourhood(partition: Partition, eps: float, hop: np.ndarray) -> float:
     """Returns the width of the neighbourhood of M*: the noise, some cells, or one sample's hop (d,)."""
     grid = partition.grid
     # M* is known to about a cell, and four are a margin. Of more than two parts some are wedges: so wide a
-    # neighbourhood would cut them back far from M*, to where a policy goes straight on, clear of the obstacle.
+    # neighbourhood would cut them back far from M*, to where a policy goes straight on, clear of it.
     cells = 4 if len(partition.parts) <= 2 else 1.5
     return max(eps, cells * grid.cell, float(np.linalg.norm(hop / grid.chart.scale)))
 
