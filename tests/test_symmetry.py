@@ -9,7 +9,7 @@ from torch import nn
 
 from hyrl_mj.learning import symmetry
 from hyrl_mj.learning.presets import preset
-from hyrl_mj.learning.training import build, export
+from hyrl_mj.learning.training import build, export, threads
 
 
 @pytest.fixture
@@ -46,6 +46,18 @@ def assert_mirrored(task, policy):
 
 
 def test_it_is_mirrored_from_the_start(task, model):
+    assert_mirrored(task, model.policy)
+
+
+@pytest.mark.slow
+def test_it_stays_mirrored_while_it_learns(task, model):
+    before = {name: w.clone() for name, w in symmetry.plain_state(model.policy, task).items()}
+    with threads(1):
+        model.learn(4_000 if task.learning.algorithm == "dqn" else 3 * 4_096)
+    after = symmetry.plain_state(model.policy, task)
+    actor = {"dqn": "q_net.q_net", "ppo": "mlp_extractor.policy_net"}[task.learning.algorithm]
+    actor += ".2.weight"
+    assert (after[actor] - before[actor]).abs().max() > 1e-3, "it has learned nothing"
     assert_mirrored(task, model.policy)
 
 

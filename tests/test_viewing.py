@@ -102,6 +102,10 @@ def test_behind_a_slow_viewer_the_arc_stays_in_real_time(play):
     assert viewer.clock.slept == [0.0] * 5
 
 
+def test_nothing_is_shown_when_the_viewer_is_closed(play):
+    assert play(0).t == []
+
+
 # ---- in a browser
 
 
@@ -211,6 +215,27 @@ def test_who_has_the_page_open_sees_the_robot_move(vehicle, arc, headless, monke
     monkeypatch.setattr(viewing, "play", play)
     viewing.view(vehicle, arc, say=say)
     assert len(received) == 20
+
+
+@pytest.mark.slow
+def test_without_a_port_the_first_free_one_from_8080_on_is_taken(vehicle, arc, headless):
+    said = []
+
+    def end(text):
+        said.append(text)
+        raise Enough
+
+    try:
+        other = socket.create_server(("127.0.0.1", 8080))
+    except OSError:  # somebody has it
+        other = None
+    try:
+        with pytest.raises(Enough):
+            viewing.view(vehicle, arc, say=end)
+    finally:
+        if other is not None:
+            other.close()
+    assert 8080 < port_of(said[0]) < 8180
 
 
 def test_a_port_that_is_taken_and_a_number_that_is_none_are_refused(vehicle, arc, headless):
