@@ -23,6 +23,19 @@ def test_episodes_repeat_bit_for_bit_at_any_number_of_threads(task: Task, thread
     np.testing.assert_array_equal(episode(threads), episode(1))
 
 
+def test_what_the_plant_returns_is_not_its_memory(task: Task) -> None:
+    plant = task.placed(task.starts(2, np.random.default_rng(0)))
+    returned = [plant.measurement, plant.qpos, plant.state, task.z(plant.measurement)]
+    kept = [values.copy() for values in returned]
+    plant.step(np.tile(task.input_limits[1], (2, 1)))
+    for values, before in zip(returned, kept, strict=True):
+        np.testing.assert_array_equal(values, before)
+    after = plant.state
+    for values in (plant.measurement, plant.qpos, plant.state):
+        values[:] = 7.0
+    np.testing.assert_array_equal(plant.state, after)
+
+
 def test_an_observation_leads_back_to_its_measurement(task: Task) -> None:
     if type(task).measured is Task.measured:  # an error names the missing method
         with pytest.raises(BadInput, match="measured"):

@@ -31,19 +31,6 @@ def test_one_sample_is_the_papers_equation_and_a_step_backward_inverts_it(task):
     np.testing.assert_allclose(task.z(plant.measurement), z, rtol=0, atol=1e-6)
 
 
-def test_what_the_plant_returns_is_not_its_memory(task):
-    plant = task.placed(task.starts(2, np.random.default_rng(0)))
-    returned = [plant.measurement, plant.qpos, plant.state, task.z(plant.measurement)]
-    kept = [values.copy() for values in returned]
-    plant.step(np.tile(task.input_limits[1], (2, 1)))
-    for values, before in zip(returned, kept, strict=True):
-        np.testing.assert_array_equal(values, before)
-    after = plant.state
-    for values in (plant.measurement, plant.qpos, plant.state):
-        values[:] = 7.0
-    np.testing.assert_array_equal(plant.state, after)
-
-
 PENDULUM = """
 <mujoco model="pendulum">
   <option timestep="0.01"/>
