@@ -118,6 +118,7 @@ _PAPER = replace(
 _PAPERS = ("ppo", "dqn")
 # Samples of preset smoke.
 _SMOKE = {"ppo": 24_576, "a2c": 65_536, "dqn": 10_000, "sac": 12_000, "td3": 12_000, "ddpg": 12_000}
+_SMOKE_MODES = 8_192
 # Stage 6, for every algorithm of stage 1. The modes of a discrete task are trained by PPO, too: the returns
 # of the ways differ by less than the error of a freely trained value function.
 _MODES_CONTINUOUS = replace(
@@ -241,7 +242,7 @@ def _stage6(task: Task, name: str, algorithm: str) -> Training:
     usual = _MODES_CONTINUOUS if continuous else _MODES_DISCRETE
     training = _with(usual, task, "modes")
     if name == "smoke":
-        return replace(training, samples=8_192, attempts=1)
+        return replace(training, samples=_SMOKE_MODES, attempts=1)
     most = task.effort.trainings
     return training if most is None else replace(training, attempts=min(training.attempts, most))
 
