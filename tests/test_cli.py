@@ -1,6 +1,11 @@
 """The command line: what people type, and what they are told when it is wrong."""
 
+import os
+import re
 import shutil
+import signal
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -140,6 +145,37 @@ def test_without_a_latest_simulation_there_is_nothing_to_replay(copied):
     assert_one_sentence(done, "latest_policy.npz is missing", "simulate it again")
 
 
+@needs_gl
+def test_a_video_that_cannot_be_written_leaves_nothing(planted_circle, tmp_path):
+    run = shutil.copytree(planted_circle[0].path, tmp_path / "run")
+    (run / "file").write_text("mine")
+    before = contents(run)
+    done = call("replay", run, "--out", run / "file" / "replay.mp4", "--size", "640x320")
+    assert_one_sentence(done, str(run / "file"))
+    assert contents(run) == before
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a window would open")
+def test_the_web_viewer_ends_with_ctrl_c(planted_circle):
+    child = subprocess.Popen(
+        [sys.executable, "-m", "hyrl_mj.cli", "view", str(planted_circle[0].path)],
+        env={**os.environ, "DISPLAY": "", "WAYLAND_DISPLAY": ""},  # with one a window would open
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        # Who runs in the background is deaf to Ctrl+C, and so would be its children.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    try:
+        assert re.search(r"http://127.0.0.1:\d+/", child.stdout.readline())
+        child.send_signal(signal.SIGINT)
+        _, complaints = child.communicate(timeout=30)
+    finally:
+        child.kill()
+    assert child.returncode == 130
+    assert "Traceback" not in complaints
+
+
 def test_robustness_prints_the_worst_case_and_the_episodes(copied, monkeypatch):
     played_before(monkeypatch, hyrl_mj.load_run(copied))
     done = call("robustness", copied, "--episodes", "8", "--noise", "uniform,adversarial")
@@ -156,6 +192,22 @@ def test_robustness_prints_the_worst_case_and_the_episodes(copied, monkeypatch):
     assert [score.eps for score in robustness.game.scores["hyrl"]] == [0.0, 0.05, 0.1]
     kinds = {(c.noise, c.controller) for c in robustness.episodes}
     assert kinds == {(n, c) for n in ("uniform", "adversarial") for c in ("policy", "hyrl")}
+
+
+@pytest.mark.parametrize(
+    ("form", "out", "file"), [("onnx", "circle.onnx", "."), ("numpy", "circle", "controller.py")]
+)
+def test_export_writes_the_controller(form, out, file, planted_circle, tmp_path):
+    (tmp_path / out / file).parent.mkdir(exist_ok=True)
+    (mine := tmp_path / out / file).write_text("mine")
+    words = ("export", planted_circle[0].path, "--to", form, "--out", tmp_path / out)
+    assert_one_sentence(call(*words), str(mine), "--force")
+    assert mine.read_text() == "mine"
+    done = call(*words, "--force")
+    assert done.returncode == 0, done.stderr
+    assert str(tmp_path / out) in done.stdout
+    assert mine.read_bytes() != b"mine"
+    assert call(*words).returncode == 0, "it has written what is there"
 
 
 def test_simulate_finds_the_worst_noise_and_prints_both_ends(copied):

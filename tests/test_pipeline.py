@@ -1,6 +1,7 @@
 """The pipeline does what is missing from a run directory, and one stage again where it is told to."""
 
 import json
+import os
 import re
 import shutil
 from dataclasses import replace
@@ -62,6 +63,13 @@ def test_config_and_page_hold_the_version_of_this_package(planted_circle):
 
 def test_what_cannot_be_drawn_is_tried_again(planted_circle):
     assert stages_done(planted_circle[0]) == [name for name in NAMES if name != "replay"]
+
+
+@pytest.mark.parametrize("name", ["policy.safetensors", "critical_set.npz", "extended_sets.npz"])
+def test_a_newer_file_with_the_same_content_changes_nothing(run, name):
+    before = stages_done(run)
+    os.utime(run.path / name)
+    assert stages_done(run) == before
 
 
 def test_another_result_makes_those_that_were_made_from_it_out_of_date(run):
