@@ -427,6 +427,19 @@ class SeldomAnywhere(Fixed):
         return self.k % 130 == 0
 
 
+class Delayed(Home):
+    """A camera that shows the place four samples late."""
+
+    def begin(self, place):
+        self.places = [place] * 5
+
+    def after(self):
+        self.places = [*self.places[1:], self.data.qpos.copy()]
+
+    def seen(self):
+        return self.places[0]
+
+
 class Servo(Flat):
     """Brakes beside the right wall, by the observation of the step before."""
 
@@ -482,6 +495,13 @@ class InUserdata(Rigged):
     _get_obs = Flat._get_obs
 
 
+class Noted(gym.ObservationWrapper):
+    """It observes what is noted there."""
+
+    def observation(self, observation):
+        return np.append(self.unwrapped.data.userdata, observation[2:])
+
+
 class Chasing(Rigged):
     """Something chases it, and is observed: that is no copy."""
 
@@ -512,12 +532,14 @@ OBSERVED = {
     "once a time": (Stamped, "is not what it observes in its state|computes what it"),
     "a scan": (Proximity, rf"{FOLLOWS}.*runs in different places"),
     "forces": (Pressed, r"observation\[\d+\] .* include_cfrc_ext_in_observation=False"),
+    "late": (Delayed, r"observation\[\d\] .*It is stored by step"),
     "seldom": (Seldom, r"observation\[\d\] .*It is stored by step"),
     "by its controller": (Servo, r"step\(\) of Servo moves the robot by what _get_obs"),
     "in the room": (Clipped, r"step\(\) of Clipped changes what _get_obs\(\) gives"),
     "a copy": (Rigged, COPIES.format(r"mocap_pos\[0\]")),
     "a copy on joints": (OnJoints, COPIES.format(r"qpos\[2\]")),
     "a filtered copy": (Filtered, COPIES.format(r"userdata\[0\]")),
+    "a noted copy": (lambda: Noted(InUserdata()), "a wrapper of .* shows in observation"),
 }
 
 # ---- what is drawn, or outlasts resets
