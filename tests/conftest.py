@@ -125,7 +125,7 @@ def task(request):
 
 
 @pytest.fixture(scope="session")
-def on_vehicle(vehicle):
+def game_on_vehicle(vehicle):
     """The worst-case game of the vehicle against planted controllers.
 
     All but the first line and the slanted one run between the nodes, where the plant's rounding errors do not
@@ -147,19 +147,16 @@ def on_vehicle(vehicle):
 
 
 @pytest.fixture(scope="session")
-def on_circle(circle):
-    """The same of the unit circle, on 754 nodes: at full speed samples lead from node to node.
-
-    2 pi / 754 = 0.05 / 6.00003.
-    """
-    from planted import circle_controller, circle_policy, halves, homing_controller
+def game_on_circle(circle):
+    """The same of the unit circle, on nodes between which samples at full speed lead."""
+    from planted import EXACT, circle_controller, circle_policy, halves, homing_controller
 
     rules = {
         "sign": circle_policy(circle, np.pi + 0.003),
         "hysteresis": circle_controller(circle, 0.4 + 0.003),
         "homing": homing_controller(circle, 0.4 + 0.003),
     }
-    return Game(circle, halves(circle), rules, 0.3, grid=Grid.with_cells(circle.chart, 754))
+    return Game(circle, halves(circle), rules, 0.3, grid=Grid.with_cells(circle.chart, EXACT))
 
 
 @pytest.fixture(scope="session")

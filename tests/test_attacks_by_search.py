@@ -67,8 +67,8 @@ def on(task, controller, starts, rounds=2, **options):
 # ---- what is found
 
 
-def test_all_that_the_game_loses_is_lost_and_nothing_that_is_won_by_far(vehicle, on_vehicle):
-    game, sign = on_vehicle, on_vehicle.controllers["sign"]
+def test_all_that_the_game_loses_is_lost_and_nothing_that_is_won_by_far(vehicle, game_on_vehicle):
+    game, sign = game_on_vehicle, game_on_vehicle.controllers["sign"]
     nodes = game.lattice.grid.nodes[game.starts]
     lost = game.value("sign", EPS)[-1, :-2][game.starts] >= NEVER
     rng = np.random.default_rng(0)

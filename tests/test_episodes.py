@@ -23,9 +23,9 @@ def record(records, controller, region, noise=None):
 
 
 @pytest.fixture(scope="module")
-def records(vehicle, on_vehicle):
+def records(vehicle, game_on_vehicle):
     """Episodes of the sign rule and of the ideal one, under every kind of noise."""
-    game = on_vehicle
+    game = game_on_vehicle
     noises = tuple(Noise(k, 0.1) for k in ("uniform", "alternating", "adversarial"))
     regions = Regions(decisions(vehicle).points, (game.lattice.grid, game.winnable(0.1)))
     loops = {name: game.controllers[name] for name in ("sign", "ideal")}
@@ -76,9 +76,9 @@ def test_adversarial_noise_is_worse_than_chance(records):
     assert near.interval[1] < record(records, "sign", "near M*", "uniform").interval[0]
 
 
-def test_no_noise_is_worse_than_the_worst(records, on_vehicle):
+def test_no_noise_is_worse_than_the_worst(records, game_on_vehicle):
     # The share of starts in the band that the game calls lost bounds what episodes lose near M*.
-    won = on_vehicle.score("sign", 0.1).won
+    won = game_on_vehicle.score("sign", 0.1).won
     for kind in ("uniform", "alternating", "adversarial"):
         mine = [record(records, "sign", region, kind) for region in ("near M*", "elsewhere")]
         lost = sum(r.episodes - r.outcomes["reached"] for r in mine)
@@ -86,8 +86,8 @@ def test_no_noise_is_worse_than_the_worst(records, on_vehicle):
 
 
 @pytest.mark.slow
-def test_the_same_seed_gives_the_same_counts(vehicle, on_vehicle):
-    sign = {"sign": on_vehicle.controllers["sign"]}
+def test_the_same_seed_gives_the_same_counts(vehicle, game_on_vehicle):
+    sign = {"sign": game_on_vehicle.controllers["sign"]}
 
     def counts(seed):
         noises = (Noise("uniform", 0.2),)
@@ -99,9 +99,9 @@ def test_the_same_seed_gives_the_same_counts(vehicle, on_vehicle):
     assert counts(3) != counts(4)
 
 
-def test_batches_add_up_and_none_is_the_same(vehicle, on_vehicle, monkeypatch):
+def test_batches_add_up_and_none_is_the_same(vehicle, game_on_vehicle, monkeypatch):
     monkeypatch.setattr(bulk, "BATCH", 50)
-    sign, noises = {"sign": on_vehicle.controllers["sign"]}, (Noise("uniform", 0.1),)
+    sign, noises = {"sign": game_on_vehicle.controllers["sign"]}, (Noise("uniform", 0.1),)
 
     def near(count):
         regions = Regions(decisions(vehicle).points)
@@ -114,15 +114,15 @@ def test_batches_add_up_and_none_is_the_same(vehicle, on_vehicle, monkeypatch):
     assert two != 2 * one
 
 
-def test_noise_that_hides_everything_is_refused(vehicle, on_vehicle):
-    sign, noises = {"sign": on_vehicle.controllers["sign"]}, (Noise("uniform", 1.5),)
+def test_noise_that_hides_everything_is_refused(vehicle, game_on_vehicle):
+    sign, noises = {"sign": game_on_vehicle.controllers["sign"]}, (Noise("uniform", 1.5),)
     with pytest.raises(BadInput, match=r"noise bound 1\.5 hides the whole state space of vehicle"):
         noisy_episodes(vehicle, Regions(decisions(vehicle).points), sign, noises, 10)
 
 
 @pytest.mark.slow
-def test_controllers_are_compared_from_starts_that_all_win_without_noise(vehicle, on_vehicle):
-    loops = {name: on_vehicle.controllers[name] for name in ("sign", "left")}
+def test_controllers_are_compared_from_starts_that_all_win_without_noise(vehicle, game_on_vehicle):
+    loops = {name: game_on_vehicle.controllers[name] for name in ("sign", "left")}
     noises = (Noise("none", 0.1), Noise("adversarial", 0.1))
     counts, (compared,) = noisy_episodes(
         vehicle, Regions(decisions(vehicle).points), loops, noises, 60

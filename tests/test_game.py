@@ -6,6 +6,7 @@ from itertools import count, pairwise, product
 import numpy as np
 import pytest
 from planted import (
+    EXACT,
     circle_controller,
     circle_policy,
     halves,
@@ -27,8 +28,6 @@ from hyrl_mj.sets import Grid
 from hyrl_mj.tasks import Outcome, get_task
 
 PI = np.pi
-# On 754 nodes the circle's own samples at full speed lead from node to node: 2 pi / 754 = 0.05 / 6.00003.
-EXACT = 754
 # From the axis the pillar can be passed only if x <= this.
 LAST_CHANCE = 1.5 - 0.751 * np.sqrt(2)
 BOUNDS = (0.0, 0.05, 0.1, 0.2)
@@ -168,17 +167,17 @@ def own(game, name, eps):
     return game.value(name, eps)[-1, :-2]
 
 
-def test_one_way_wins_the_starts_whose_way_is_open(on_vehicle):
-    game = on_vehicle
+def test_one_way_wins_the_starts_whose_way_is_open(game_on_vehicle):
+    game = game_on_vehicle
     for name, samples in zip(("left", "right"), game.limit.samples, strict=True):
         for eps in (0.0, 0.1):
             won = own(game, name, eps) < NEVER
             np.testing.assert_array_equal(won[game.starts], (samples < NEVER)[game.starts])
 
 
-def test_the_sign_rule_loses_where_noise_hides_the_sign_and_nowhere_else(on_vehicle):
+def test_the_sign_rule_loses_where_noise_hides_the_sign_and_nowhere_else(game_on_vehicle):
     # It can be held in -eps <= y < eps until no way is open, from wherever it comes.
-    game = on_vehicle
+    game = game_on_vehicle
     y = game.lattice.grid.nodes[:, 1]
     for eps in (0.05, 0.1):
         region = game.starts & game.winnable(eps)
@@ -191,8 +190,8 @@ def test_the_sign_rule_loses_where_noise_hides_the_sign_and_nowhere_else(on_vehi
         assert 0 < score.won == score.won_any == 1 - hidden[region].mean() < 1
 
 
-def test_where_nothing_can_be_won_nothing_is_won(on_vehicle, monkeypatch):
-    game = on_vehicle
+def test_where_nothing_can_be_won_nothing_is_won(game_on_vehicle, monkeypatch):
+    game = game_on_vehicle
     winnable = game.winnable
     monkeypatch.setattr(game, "winnable", lambda eps: winnable(eps) & (eps < 0.06))
     assert game.score("ideal", 0.05).won == 1
@@ -201,8 +200,8 @@ def test_where_nothing_can_be_won_nothing_is_won(on_vehicle, monkeypatch):
 
 
 @pytest.mark.slow
-def test_every_start_is_won_or_lost_and_no_more_are_won_under_more_noise(on_vehicle):
-    game = on_vehicle
+def test_every_start_is_won_or_lost_and_no_more_are_won_under_more_noise(game_on_vehicle):
+    game = game_on_vehicle
     for name in game.controllers:
         # x = 3 m comes some day, and with it the end.
         assert not (game.value(name, 0.1) == NEVER)[:, np.append(game.starts, [True] * 2)].any()
@@ -226,9 +225,9 @@ def some(nodes, mask, n=80):
     ("name", "q0", "eps"), [("sign off", None, 0.1), ("ideal", 1, 0.05), ("narrow", None, 0.1)]
 )
 def test_the_worst_signal_crashes_lost_starts_in_the_sample_foreseen(
-    vehicle, on_vehicle, name, q0, eps
+    vehicle, game_on_vehicle, name, q0, eps
 ):
-    game = on_vehicle
+    game = game_on_vehicle
     value = game.value(name, eps)[-1 if q0 is None else q0, :-2]
     at, z0 = some(game.lattice.grid.nodes, game.starts & (value > NEVER))
     signal = worst_signal(game, name, z0, eps, q0)
@@ -248,8 +247,8 @@ def arrivals(task, arcs):
 
 @pytest.mark.parametrize("kind", ["worst", "adversarial"])
 @pytest.mark.parametrize("name", ["sign off", "ideal"])
-def test_no_noise_makes_a_won_start_of_the_vehicle_fail(vehicle, on_vehicle, name, kind):
-    game = on_vehicle
+def test_no_noise_makes_a_won_start_of_the_vehicle_fail(vehicle, game_on_vehicle, name, kind):
+    game = game_on_vehicle
     eps = 0.1
     value = own(game, name, eps)
     at, z0 = some(game.lattice.grid.nodes, game.starts & (value < NEVER), 60)
@@ -322,8 +321,8 @@ def test_a_run_that_swings_for_ever_is_held_at_both_ends(circle):
 # ---- unit circle: the same in MuJoCo
 
 
-def test_the_worst_signal_keeps_trapped_starts_from_arriving(circle, on_circle):
-    game = on_circle
+def test_the_worst_signal_keeps_trapped_starts_from_arriving(circle, game_on_circle):
+    game = game_on_circle
     eps = 12 * game.lattice.grid.cell
     at = np.flatnonzero(own(game, "sign", eps) == NEVER)
     z0 = game.lattice.grid.nodes[at]
@@ -338,8 +337,8 @@ def test_the_worst_signal_keeps_trapped_starts_from_arriving(circle, on_circle):
 @pytest.mark.parametrize(
     ("name", "kind"), [("sign", "worst"), ("hysteresis", "worst"), ("hysteresis", "adversarial")]
 )
-def test_no_noise_makes_a_won_start_of_the_circle_late(circle, on_circle, name, kind):
-    game = on_circle
+def test_no_noise_makes_a_won_start_of_the_circle_late(circle, game_on_circle, name, kind):
+    game = game_on_circle
     eps = 12 * game.lattice.grid.cell
     value = own(game, name, eps)
     at, z0 = some(game.lattice.grid.nodes, value < NEVER, 60)
@@ -354,8 +353,8 @@ def test_no_noise_makes_a_won_start_of_the_circle_late(circle, on_circle, name, 
 # ---- the limit: the ways
 
 
-def test_each_way_past_the_pillar_is_open_as_far_as_geometry_says(on_vehicle):
-    game = on_vehicle
+def test_each_way_past_the_pillar_is_open_as_far_as_geometry_says(game_on_vehicle):
+    game = game_on_vehicle
     x, y = game.lattice.grid.nodes.T
     for side, samples in zip((1, -1), game.limit.samples, strict=True):
         room, open_ = LAST_CHANCE - x + side * y, samples < NEVER
@@ -366,8 +365,8 @@ def test_each_way_past_the_pillar_is_open_as_far_as_geometry_says(on_vehicle):
         np.testing.assert_array_equal(samples[open_], np.ceil((3 - x[open_]) / 0.05 - 1e-6))
 
 
-def test_each_way_round_the_circle_is_open_and_takes_the_time_it_takes(on_circle):
-    game = on_circle
+def test_each_way_round_the_circle_is_open_and_takes_the_time_it_takes(game_on_circle):
+    game = game_on_circle
     theta, out = game.lattice.grid.nodes[:, 0], ~game.lattice.arrived
     clockwise, counter = game.limit.samples
     np.testing.assert_array_equal(clockwise[out], np.ceil((theta[out] - 0.3) / 0.05))
@@ -380,8 +379,8 @@ def test_each_way_round_the_circle_is_open_and_takes_the_time_it_takes(on_circle
 # ---- the limit: what can be won
 
 
-def test_a_start_is_winnable_if_each_side_that_may_be_measured_is_open(on_vehicle):
-    game = on_vehicle
+def test_a_start_is_winnable_if_each_side_that_may_be_measured_is_open(game_on_vehicle):
+    game = game_on_vehicle
     x, y = game.lattice.grid.nodes.T
     on_axis, masks = game.starts & (np.abs(y) < 1e-9), []
     for eps in BOUNDS:
@@ -428,8 +427,8 @@ def test_the_limit_wins_what_is_winnable_and_no_planted_controller_beats_it(name
             assert score.won < 1 or score.time >= limit.time
 
 
-def test_with_room_for_the_noise_the_limit_holds_the_way_that_it_has_picked(on_circle):
-    game = on_circle
+def test_with_room_for_the_noise_the_limit_holds_the_way_that_it_has_picked(game_on_circle):
+    game = game_on_circle
     for eps in (0.05, 0.2):
         moves, places = game.moves(LIMIT, eps), game.lattice.places
         going = np.append(~game.lattice.arrived, [False, False])

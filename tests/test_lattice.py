@@ -41,7 +41,7 @@ def some_moves(lattice, n=3000):
     return rng.integers(len(lattice.levels), size=n), rng.choice(np.flatnonzero(lattice.running), n)
 
 
-# ---- vehicle: from node to node
+# ---- vehicle
 
 
 def test_nodes_of_the_vehicle_have_arrived_on_the_line_and_failed_where_it_crashes(

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from planted import (
+    EXACT,
     ChartPolicy,
     circle_policy,
     decisions,
@@ -35,8 +36,6 @@ from hyrl_mj.tasks import Outcome
 WON, WON_FROM_SOME, UNCLEAR, BEATEN, UNWINNABLE, OVER = MapClass
 
 PI = np.pi
-# On 754 nodes full speed leads from node to node on the circle.
-EXACT = 754
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -50,16 +49,16 @@ def whole_curve():
 # ---- scores
 
 
-def test_the_ideal_rule_wins_everything_but_the_wrong_start_mode(on_vehicle):
-    score = on_vehicle.score("ideal", 0.1)
+def test_the_ideal_rule_wins_everything_but_the_wrong_start_mode(game_on_vehicle):
+    score = game_on_vehicle.score("ideal", 0.1)
     assert score.won == 1.0
     assert 0.9 < score.won_any < 1.0
     assert score.time == score.time_any == pytest.approx(3.0)
     assert score.excursion is None, "every run is over some day"
 
 
-def test_the_excursion_of_a_trapped_policy_is_the_far_side(on_circle):
-    game = on_circle
+def test_the_excursion_of_a_trapped_policy_is_the_far_side(game_on_circle):
+    game = game_on_circle
     assert game.score("sign", 0.1).excursion == pytest.approx(PI, abs=game.lattice.grid.cell)
     assert game.score("sign", 0.1).won == pytest.approx(1 - 0.2 / (2 * PI), abs=2e-3)
 
@@ -82,8 +81,8 @@ def test_noise_on_all_coordinates_is_worse_where_all_matter(vehicle):
     assert (more > less).any()
 
 
-def test_noise_beyond_what_was_prepared_is_refused(on_vehicle):
-    game = on_vehicle
+def test_noise_beyond_what_was_prepared_is_refused(game_on_vehicle):
+    game = game_on_vehicle
     with pytest.raises(BadInput, match=r"noise 0.25 exceeds the largest bound of this game, 0.2"):
         game.score("sign", 0.25)
 
@@ -162,20 +161,20 @@ def test_what_nobody_reaches_in_time_is_not_winnable(circle):
 
 
 @pytest.mark.parametrize("name", ["narrow", "ideal", "grazing"])
-def test_the_margin_of_the_ideal_rule_is_its_overlap_or_its_clearance(on_vehicle, name):
+def test_the_margin_of_the_ideal_rule_is_its_overlap_or_its_clearance(game_on_vehicle, name):
     # Beyond its overlap noise turns a run back that has no room left; the pillar is at 0.751 m.
     known = {"narrow": 0.054, "ideal": 0.154, "grazing": 0.904 - 0.751}[name]
-    game = on_vehicle
+    game = game_on_vehicle
     assert game.margin(name) == pytest.approx(known, abs=game.lattice.grid.cell)
 
 
-def test_the_margin_of_the_sign_rule_is_half_of_a_sample_s_way(on_vehicle, on_circle):
-    for game in (on_vehicle, on_circle):
+def test_the_margin_of_the_sign_rule_is_half_of_a_sample_s_way(game_on_vehicle, game_on_circle):
+    for game in (game_on_vehicle, game_on_circle):
         assert game.margin("sign") == pytest.approx(0.025, abs=game.lattice.grid.cell)
 
 
-def test_the_margin_is_no_larger_than_what_was_prepared(on_circle):
-    game = on_circle
+def test_the_margin_is_no_larger_than_what_was_prepared(game_on_circle):
+    game = game_on_circle
     assert game.margin("hysteresis") == pytest.approx(0.3, abs=game.lattice.grid.cell)
     assert game.margin("hysteresis") <= 0.3
 
@@ -183,8 +182,8 @@ def test_the_margin_is_no_larger_than_what_was_prepared(on_circle):
 # ---- maps
 
 
-def test_the_map_s_classes_are_those_of_the_starts(vehicle, on_vehicle):
-    game = on_vehicle
+def test_the_map_s_classes_are_those_of_the_starts(vehicle, game_on_vehicle):
+    game = game_on_vehicle
 
     def classes(name, points):
         return game.map(name, 0.1)[game.lattice.grid.nearest(np.array(points))].tolist()
@@ -222,8 +221,8 @@ def test_where_samples_end_between_nodes_a_map_calls_lost_what_is_lost_on_the_pl
 # ---- worst signals
 
 
-def test_the_worst_signal_of_several_starts_is_that_of_each_alone(vehicle, on_vehicle):
-    game = on_vehicle
+def test_the_worst_signal_of_several_starts_is_that_of_each_alone(vehicle, game_on_vehicle):
+    game = game_on_vehicle
     z0 = np.array([[0.0, 0.05], [0.3, -0.05], [0.4, 0.0]])
     together = worst_signal(game, "sign", z0, 0.1)
     for i in range(len(z0)):
@@ -232,8 +231,8 @@ def test_the_worst_signal_of_several_starts_is_that_of_each_alone(vehicle, on_ve
         assert not together.values[len(alone.values) :, i].any(), "none after the end"
 
 
-def test_a_start_between_the_nodes_is_led_into_the_pillar_too(vehicle, on_vehicle):
-    game = on_vehicle
+def test_a_start_between_the_nodes_is_led_into_the_pillar_too(vehicle, game_on_vehicle):
+    game = game_on_vehicle
     x = np.random.default_rng(0).uniform(0.0, 0.4, 50)
     z0 = np.stack([x, np.full_like(x, 0.025)], axis=-1)
     signal = worst_signal(game, "sign", z0, 0.1)
@@ -243,9 +242,9 @@ def test_a_start_between_the_nodes_is_led_into_the_pillar_too(vehicle, on_vehicl
     assert {arc.outcome for arc in arcs} == {"crashed"}
 
 
-def test_no_milder_noise_crashes_what_the_worst_does_not(vehicle, on_vehicle):
+def test_no_milder_noise_crashes_what_the_worst_does_not(vehicle, game_on_vehicle):
     """Rounding errors of the plant do not let a run escape, although the rule is torn on the axis."""
-    game = on_vehicle
+    game = game_on_vehicle
     x, y = np.meshgrid(np.arange(0, 0.31, 0.05), np.linspace(-0.0875, 0.0875, 8))
     z0 = np.stack([x.ravel(), y.ravel()], axis=-1)
     signals = [
@@ -265,9 +264,11 @@ def test_no_milder_noise_crashes_what_the_worst_does_not(vehicle, on_vehicle):
     np.testing.assert_array_equal(worst, lost)
 
 
-def test_an_answer_is_settled_unless_it_changes_right_beside_the_node(on_vehicle):
-    answers = on_vehicle.answers["sign"]
-    y = on_vehicle.lattice.grid.spacing[1] * np.arange(-answers.pad[1], answers.settled.shape[2])
+def test_an_answer_is_settled_unless_it_changes_right_beside_the_node(game_on_vehicle):
+    answers = game_on_vehicle.answers["sign"]
+    y = game_on_vehicle.lattice.grid.spacing[1] * np.arange(
+        -answers.pad[1], answers.settled.shape[2]
+    )
     torn = np.unique(np.nonzero(~answers.settled)[2])
     # Where the sides part, and where the pillar is passed and it goes straight on.
     assert set(np.round(y[torn] - 1.5, 4)) == {-0.9, 0.0, 0.9}
@@ -280,8 +281,8 @@ CELLS = {"vehicle": 120, "unit_circle": EXACT}
 
 
 @pytest.fixture(scope="module", params=CELLS)
-def examined(request, on_vehicle, on_circle):
-    game = {"vehicle": on_vehicle, "unit_circle": on_circle}[request.param]
+def examined(request, game_on_vehicle, game_on_circle):
+    game = {"vehicle": game_on_vehicle, "unit_circle": game_on_circle}[request.param]
     task, named = game.task, {"policy": game.controllers["sign"]}
     named["hyrl"] = [*game.controllers.values()][-1]
     cells = CELLS[request.param]
@@ -348,8 +349,8 @@ def test_an_examination_survives_being_written(examined, tmp_path):
 # ---- files
 
 
-def test_a_game_refuses_what_it_does_not_know(on_vehicle):
-    game = on_vehicle
+def test_a_game_refuses_what_it_does_not_know(game_on_vehicle):
+    game = game_on_vehicle
     with pytest.raises(BadInput, match="unknown controller 'mine'"):
         game.score("mine", 0.1)
     for eps in (-0.1, float("nan")):
