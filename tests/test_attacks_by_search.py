@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field, replace
+from itertools import cycle
 
 import numpy as np
 import pytest
@@ -449,6 +450,31 @@ class Watcher:
 
 
 @dataclass(frozen=True)
+class Rememberer:
+    """As `Watcher`, a policy with one mode that remembers what it measured."""
+
+    signal: np.ndarray
+    y: float
+    everywhere: bool = False
+
+    def start(self, n):
+        return np.full((n, 60, 2), np.nan)
+
+    def act(self, measured):
+        return np.zeros((len(measured), 1))
+
+    def act_after(self, past, measured):
+        k = np.isfinite(past[:, :, 1]).sum(axis=1)
+        u = np.zeros((len(measured), 1))
+        for row in np.flatnonzero(k >= FIRST + WINDOW):
+            seen = past[row, 60 - k[row] :][FIRST : FIRST + WINDOW]
+            x = 0.05 * np.arange(FIRST, FIRST + WINDOW)
+            noise = seen - np.stack([x, np.full(WINDOW, self.y)], axis=1)
+            u[row] = matches(noise, self.signal, self.everywhere).sum() >= ENOUGH
+        return u, np.concatenate([past[:, 1:], measured[:, None]], axis=1)
+
+
+@dataclass(frozen=True)
 class Turner:
     """A controller that leaves the arena if the noise is +eps in mode 0, and -eps after its jump."""
 
@@ -468,11 +494,15 @@ def default(**options):
     return Budget(rounds=Effort().attack_rounds, **options)
 
 
-@pytest.mark.parametrize("name", SIGNALS)
-def test_what_one_signal_breaks_is_broken(vehicle, name):
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "make"), [*zip(SIGNALS, cycle(["one mode", "several modes"]))])
+def test_what_one_signal_breaks_is_broken(vehicle, name, make):
     signal, everywhere = SIGNALS[name], name == "the second column alone"
     start = STARTS[:1]
-    loop = Watcher(signal, start[0, 1], everywhere)
+    if make == "one mode":
+        loop = PolicyController(Rememberer(signal, start[0, 1], everywhere))
+    else:
+        loop = Watcher(signal, start[0, 1], everywhere)
     # The known signal alone breaks it, and none does not.
     known = np.zeros((60, 1, 2))
     known[FIRST : FIRST + WINDOW, 0] = EPS * signal
