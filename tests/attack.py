@@ -1,4 +1,4 @@
-"""Attacks hyrl_mj: crashes, kills, damaged and crafted files, wrong settings, rivals, bad machines.
+"""Attacks hyrl_mj: crashes, kills, damaged and crafted files, wrong settings and tasks, rivals, bad machines.
 
     python tests/attack.py                        # all of it
     python tests/attack.py --short                # a sample of each attack
@@ -41,6 +41,7 @@ from attacks import (
     received,
     small,
     surroundings,
+    tasks,
     writers,
 )
 from attacks.material import Material
@@ -81,6 +82,7 @@ ATTACKS = {
     "configurations": Attack(
         "one setting changed, through every stage", configurations.trials, 200, 4
     ),
+    "tasks": Attack("task file or MJCF with one mistake", tasks.trials, 100, 2),
     "writers": Attack("two and four writers, and a reader", writers.trials, 4, 1),
     "surroundings": Attack("pairs of bad surroundings", surroundings.trials, 4, 1),
 }
