@@ -414,7 +414,7 @@ def test_a_single_part_leaves_nothing_to_decide(vehicle):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["vehicle", "circle"])
 def test_the_limit_wins_what_is_winnable_and_no_planted_controller_beats_it(name, request):
-    game = request.getfixturevalue(f"on_{name}")
+    game = request.getfixturevalue(f"game_on_{name}")
     assert game.score(LIMIT, 0.0).won_any == 1.0
     for eps in (0.05, 0.1):
         limit = game.score(LIMIT, eps)
