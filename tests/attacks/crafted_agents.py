@@ -135,6 +135,14 @@ def zeros(file: zipfile.ZipFile, name: str) -> None:
             member.write(bytes(2**22))
 
 
+def crowded(folder: Path) -> str:
+    """A zip of a hundred thousand members, and no policy."""
+    with zipfile.ZipFile(folder / "agent.zip", "w") as file:
+        for number in range(100_000):
+            file.writestr(f"{number}", b"")
+    return "agent.zip"
+
+
 def marked(folder: Path, flag: int, method: int) -> str:
     """A zip whose members say that they are encrypted, or packed in a way that nobody knows."""
     write_zip(folder)
@@ -175,6 +183,13 @@ def overlapping(names: Sequence[str], content: bytes) -> bytes:
         at += 30 + len(name)
     end = (0, 0, len(names), len(names), len(directory), len(heads) + len(packed), 0)
     return heads + packed + directory + struct.pack("<4s4H2LH", b"PK\5\6", *end)
+
+
+def cut(folder: Path) -> str:
+    write_zip(folder)
+    path = folder / "agent.zip"
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    return "agent.zip"
 
 
 def deep_layers(folder: Path) -> str:
@@ -234,12 +249,19 @@ def tensors_of(*places: tuple[list[int], list[int]]) -> bytes:
     )
 
 
+def naming(folder: Path, task: str) -> str:
+    """A description that names a Python file, or a task that nobody knows."""
+    (folder / "evil.py").write_text(f"open({str(folder / MARKER)!r}, 'w').close()\n")
+    return write_safetensors(folder, about={"task": task.format(folder=folder)})
+
+
 def described(folder: Path, text: str) -> str:
     write_safetensors(folder)
     (folder / "agent.json").write_text(text, encoding="utf-8")
     return "agent.safetensors"
 
 
+NAN = torch.full((1, 8), float("nan"))
 FILES: dict[str, Callable[[Path], str]] = {
     "zip, policy.pth is a pickle": partial(pickled, protocol=2),
     "zip, policy.pth is a pickle of protocol 0": partial(pickled, protocol=0),
@@ -253,8 +275,10 @@ FILES: dict[str, Callable[[Path], str]] = {
     "zip, data larger than its directory says": partial(lying, member="data"),
     "zip, a bomb": partial(bomb, compression=zipfile.ZIP_DEFLATED),
     "zip, a bomb packed by LZMA": partial(bomb, compression=zipfile.ZIP_LZMA),
+    "zip, 100,000 members": crowded,
     "zip, encrypted": partial(marked, flag=1, method=0),
     "zip, of an unknown compression": partial(marked, flag=0, method=77),
+    "zip, cut in half": cut,
     "zip64, a policy.pth of 2**60 bytes": partial(vast, file_size=2**60, compress_size=2**60),
     "zip64, a policy.pth packed in 2**60 bytes": partial(vast, compress_size=2**60),
     "zip64, a policy.pth at 2**62": partial(vast, header_offset=2**62),
@@ -265,33 +289,80 @@ FILES: dict[str, Callable[[Path], str]] = {
         folder, overlapping(("a/data.pkl", *(f"a/data/{n}" for n in range(1_000))), bytes(2**24))
     ),
     "zip, 20,000 layers": deep_layers,
+    "zip, a list of tensors": partial(write_zip, policy=[torch.zeros(2)]),
+    "zip, a strided tensor of 2**40 numbers": lambda folder: write_zip(
+        folder, changed(action_net__weight=torch.zeros(1, 1).expand(2**20, 2**20))
+    ),
     "zip, a network without numbers": lambda folder: write_zip(
         folder, changed(action_net__weight=torch.zeros(0, 0), action_net__bias=torch.zeros(0))
     ),
     "zip, a weight in three dimensions": lambda folder: write_zip(
         folder, changed(action_net__weight=torch.zeros(1, 8, 1))
     ),
+    "zip, NaN": lambda folder: write_zip(folder, changed(action_net__weight=NAN)),
     "zip, complex weights": lambda folder: write_zip(
         folder, changed(action_net__weight=torch.zeros(1, 8, dtype=torch.complex64))
     ),
     "zip, a name that colours the terminal": lambda folder: write_zip(
         folder, {f"{ESCAPE}.weight": torch.zeros(1, 2)}
     ),
+    "zip, trained under VecNormalize": lambda folder: write_zip(
+        folder,
+        data={
+            "num_timesteps": 1_000, "clip_range": 0.2,
+            "_last_original_obs": {":type:": "ndarray", ":serialized:": "gA=="},
+        },
+    ),
+    "zip, CrossQ": lambda folder: write_zip(
+        folder,
+        {
+            "actor.latent_pi.0.ra_mean": torch.zeros(2),
+            "actor.latent_pi.1.weight": torch.zeros(8, 2),
+            "actor.latent_pi.1.bias": torch.zeros(8),
+            "actor.mu.weight": torch.zeros(1, 8),
+            "actor.mu.bias": torch.zeros(1),
+            "actor.log_std.weight": torch.zeros(1, 8),
+            "actor.log_std.bias": torch.zeros(1),
+        },
+    ),
+    "zip, deep metadata": lambda folder: write_zip(folder, data="[" * 10**5 + "]" * 10**5),
+    "zip, metadata of 10**5 digits": lambda folder: write_zip(folder, data=f'{{"a": {"9" * 10**5}}}'),
     "zip, an activation that colours the terminal": lambda folder: write_zip(
         folder, data={"policy_kwargs": {":type:": "dict", "activation_fn": ESCAPE}}
     ),
+    "zip, empty": lambda folder: garbage(folder, "agent.zip", b""),
     "zip, 4 GB of nothing": lambda folder: sparse(folder, "agent.zip"),
     "safetensors, 4 GB of nothing": lambda folder: (
         write_safetensors(folder), sparse(folder, "agent.safetensors")
     )[1],
+    "safetensors, whose description names a Python file": partial(naming, task="{folder}/evil.py"),
+    "safetensors, whose description names a file near by": partial(naming, task="./evil.py"),
+    "safetensors, whose algorithm is a module": lambda folder: write_safetensors(
+        folder, about={"algorithm": "os:system"}
+    ),
     "safetensors, whose activation is a list": lambda folder: write_safetensors(
         folder, about={"activation": ["tanh"]}
+    ),
+    "safetensors, whose task is a dictionary": lambda folder: write_safetensors(
+        folder, about={"task": {"a": 1}}
+    ),
+    "safetensors, a header of 2**60 bytes": lambda folder: write_safetensors(
+        folder, header(b"{}", size=2**60)
+    ),
+    "safetensors, a tensor of 2**62 numbers": lambda folder: write_safetensors(
+        folder, tensors_of(([2**31, 2**31], [0, 64]))
+    ),
+    "safetensors, tensors that overlap": lambda folder: write_safetensors(
+        folder, tensors_of(*[([16], [0, 64])] * 10_000)
     ),
     "safetensors, tensors that overlap in part": lambda folder: write_safetensors(
         folder, tensors_of(([12], [0, 48]), ([12], [16, 64]))
     ),
     "safetensors, a gap between tensors": lambda folder: write_safetensors(
         folder, tensors_of(([4], [0, 16]), ([4], [48, 64]))
+    ),
+    "safetensors, a deep header": lambda folder: write_safetensors(
+        folder, header(b"[" * 10**5 + b"]" * 10**5)
     ),
     "safetensors, a deep description": lambda folder: described(folder, "[" * 10**5),
     "safetensors, a description with half a character": lambda folder: described(

@@ -9,9 +9,9 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from attacks.crafted_agents import ESCAPE, sparse
+from attacks.crafted_agents import ESCAPE, garbage, sparse
 
-FLOAT = TensorProto.FLOAT
+FLOAT, INT64, BOOL = TensorProto.FLOAT, TensorProto.INT64, TensorProto.BOOL
 
 
 def constant(name: str, values: Any) -> onnx.TensorProto:
@@ -46,6 +46,50 @@ SUM = (node("ReduceSum", ("obs", "axis")), constant("axis", np.array([1])))
 
 def honest_model(folder: Path) -> str:
     return model(folder, SUM[:1], SUM[1:])
+
+
+def looped(folder: Path, turns: int, body_adds: bool = False) -> str:
+    """A loop of so many turns; with `body_adds` each turn also doubles a tensor."""
+    body_nodes = [node("Identity", ("go",), "go_on")]
+    body_nodes.append(
+        helper.make_node("Concat", ["x", "x"], ["x_on"], axis=0)
+        if body_adds
+        else node("Identity", ("x",), "x_on")
+    )
+    info = helper.make_tensor_value_info
+    body = helper.make_graph(
+        body_nodes,
+        "body",
+        [info("turn", INT64, ()), info("go", BOOL, ()), info("x", FLOAT, None)],
+        [info("go_on", BOOL, ()), info("x_on", FLOAT, None)],
+    )
+    loop = helper.make_node("Loop", ["turns", "yes", "sum"], ["u"], body=body)
+    summed = node("ReduceSum", ("obs", "axis"), "sum")
+    constants = [constant("turns", np.int64(turns)), constant("yes", np.bool_(True)), SUM[1]]
+    return model(folder, [summed, loop], constants)
+
+
+def random(folder: Path, kind: str) -> str:
+    """A model that draws random numbers."""
+    summed = node("ReduceSum", ("obs", "axis"), "sum")
+    if kind == "Dropout":
+        drawn = node("Dropout", ("sum", "ratio", "training"), "u")
+        more = [constant("ratio", np.float32(0.5)), constant("training", np.bool_(True))]
+        return model(folder, [summed, drawn], [SUM[1], *more])
+    if kind == "Bernoulli":
+        squashed = node("Sigmoid", ("sum",), "share")
+        return model(folder, [summed, squashed, node(kind, ("share",))], SUM[1:])
+    drawn = node(kind, ("sum",), "drawn")
+    return model(folder, [summed, drawn, node("Add", ("sum", "drawn"))], SUM[1:])
+
+
+def filled(folder: Path, shape: Sequence[int]) -> str:
+    """A constant that the file does not hold, but whose shape it names."""
+    big = node("ConstantOfShape", ("shape",), "big")
+    total = node("ReduceMax", ("big",), "most", keepdims=0)
+    summed = node("ReduceSum", ("obs", "axis"), "sum")
+    nodes = [big, total, summed, node("Add", ("sum", "most"))]
+    return model(folder, nodes, [constant("shape", np.array(shape)), SUM[1]])
 
 
 def expanded(folder: Path) -> str:
@@ -94,7 +138,16 @@ def nested(folder: Path) -> str:
 
 
 FILES: dict[str, Callable[[Path], str]] = {
+    "onnx, a loop of 2**60 turns": partial(looped, turns=2**60),
+    "onnx, a loop of 10**8 turns": partial(looped, turns=10**8),
+    "onnx, a loop that doubles a tensor": partial(looped, turns=60, body_adds=True),
+    **{
+        f"onnx, {kind}": partial(random, kind=kind)
+        for kind in ("RandomNormalLike", "RandomUniformLike", "Bernoulli", "Dropout")
+    },
     "onnx, a branch in a branch, and chance": nested,
+    "onnx, 2**50 zeros": partial(filled, shape=(2**25, 2**25)),
+    "onnx, 2**31 zeros": partial(filled, shape=(2**15, 2**16)),
     "onnx, an input that fills the memory": expanded,
     "onnx, weights in another file": partial(elsewhere, location="victim/secret.txt"),
     "onnx, weights in a file above": partial(elsewhere, location="../../../../../../etc/passwd"),
@@ -105,12 +158,31 @@ FILES: dict[str, Callable[[Path], str]] = {
     "onnx, weights of a function in another file": partial(
         elsewhere, location="victim/secret.txt", inside="function", offset=2**60
     ),
+    "onnx, without outputs": lambda folder: model(folder, SUM[:1], SUM[1:], output=None),
     "onnx, an output of no node": lambda folder: model(folder, [], []),
     "onnx, strings": lambda folder: model(
         folder, [node("Identity", ("obs",))], given=(TensorProto.STRING, ("n", 2)),
         output=(TensorProto.STRING, ("n", 2)),
     ),
+    "onnx, NaN": lambda folder: model(
+        folder, [node("Log", ("minus",), "nan"), node("Add", ("obs", "nan"), "sum"),
+                 node("ReduceSum", ("sum", "axis"))],
+        [constant("minus", np.float32([-1.0])), SUM[1]],
+    ),
+    "onnx, three inputs for one": lambda folder: model(
+        folder, [node("Concat", ("obs", "obs"), axis=1)], output=(FLOAT, ("n", 4))
+    ),
+    "onnx, the rows of a batch depend on each other": lambda folder: model(
+        folder, [node("ReduceMean", ("obs",), "mean", keepdims=0),
+                 node("ReduceSum", ("obs", "axis"), "sum"), node("Add", ("sum", "mean"))],
+        SUM[1:],
+    ),
     "onnx, an unknown operator": lambda folder: model(folder, [node(ESCAPE, ("obs",))]),
+    "onnx, of another domain": lambda folder: model(
+        folder, [node("Python", ("obs",), domain="evil.ops")]
+    ),
     "onnx, of opset 10**6": lambda folder: model(folder, SUM[:1], SUM[1:], opset=10**6),
+    "onnx, garbage": partial(garbage, name="agent.onnx", content=b"\x08\x96\x01" * 1000),
+    "onnx, empty": partial(garbage, name="agent.onnx", content=b""),
     "onnx, 4 GB of nothing": partial(sparse, name="agent.onnx"),
 }  # fmt: skip
