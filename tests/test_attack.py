@@ -41,7 +41,7 @@ OPENED = {
         "from hyrl_mj.gym_import.pool import Pool; Pool.try_out = lambda *given: None",
     ),
     "modules in the current folder": (
-        "^modules", 46, "was executed|has no attribute",
+        "^modules", 46, "was executed|has no attribute|is not a package",
         "from attacks import folders\n"
         "folders.PROGRAM = f'import sys; sys.path.insert(0, \"\"); {folders.PROGRAM}'",
     ),
