@@ -63,9 +63,8 @@ class WayToGo:
         pairs, ends = nodes.neighbours(), np.flatnonzero(goal)
         ways = shortest_ways(chart, z, pairs, free, ends, weight=weight)
         leads = np.isfinite(ways)
-        starts = task.starts(
-            1_000, np.random.default_rng(0)
-        )  # as many as tell whether stage 1 arrives
+        # As many starts as tell whether stage 1 arrives.
+        starts = task.starts(1_000, np.random.default_rng(0))
         if not leads[nodes.nearest(starts)].any():
             what = "leads from its starts to its goal" if goal.any() else "has a goal to lead to"
             raise NoWay(
